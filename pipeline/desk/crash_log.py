@@ -22,7 +22,7 @@ from pipeline.errors import PipelineError
 from pipeline.output import OWNERS_FOLDER
 
 _BEGINS, _ENDS = "begins:", "ends:"  # the first words of the lines about a desk as a whole
-_WHOLE = re.compile(rf"\S+ \S+ (\d+) ({_BEGINS}|{_ENDS})")
+_WHOLE = re.compile(rf"\S+ \S+ (\S+) (\d{{1,9}}) ({_BEGINS}|{_ENDS})")
 
 
 class CrashLog:
@@ -85,9 +85,9 @@ class CrashLog:
             self._file.close()
 
     def _note(self, text: str, process: int | None = None) -> None:
-        """Write lines to the log, each with the time and the id of a desk's process."""
+        """Write lines to the log, with the time, the computer, and the id of a desk's process."""
         now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%SZ")
-        prefix = f"{now} {process or os.getpid()} "
+        prefix = f"{now} {_computer()} {process or os.getpid()} "
         lines = "".join(f"{prefix}{line}\n" for line in text.splitlines())
         with suppress(OSError, ValueError):  # the disk is full, or the desk has ended
             if self._file:
@@ -131,17 +131,22 @@ def _open_private(path: str, flags: int) -> int:
 
 
 def _list_killed(log: Path) -> list[int]:
-    """Return the processes of desks that began according to a log, did not end, and are gone."""
+    """Return the processes of this computer's desks that began, did not end, and are gone."""
     if not log.exists():
         return []
     begun: dict[int, bool] = {}
     for line in log.read_text(encoding="utf-8", errors="replace").splitlines():
-        if match := _WHOLE.match(line):
-            begun[int(match[1])] = match[2] == _BEGINS
+        if (match := _WHOLE.match(line)) and match[1] == _computer():
+            begun[int(match[2])] = match[3] == _BEGINS
     # In a new container, this process may have the id of a killed desk.
     return [
         one for one in begun if begun[one] and (one == os.getpid() or not psutil.pid_exists(one))
     ]
+
+
+def _computer() -> str:
+    """Return the name of this computer or container; only its own processes can be looked up."""
+    return "-".join(platform.node().split()) or "-"
 
 
 def _name(error: BaseException) -> str:

@@ -242,10 +242,13 @@ class Account:
 
     def __str__(self) -> str:
         """Return "Jane Doe (moodle 1024)" or "doejane (canvas 1024: doejane_1024_7_lab.zip)"."""
-        if not self.number and not self.download:
-            return self.name
         more = f": {self.download}" if self.download else ""
-        return f"{self.name} ({self.platform} {self.number or _NO_NUMBER}{more})"
+        number = f" ({self.platform} {self.number or _NO_NUMBER}{more})"
+        known = number if self.number or self.download else ""
+        again = Account.read(self.name + known)
+        if (again.name, again.number) == (self.name, self.number):
+            return self.name + known
+        return self.name.replace("(", "[") + known  # a student's name that looks like an account
 
 
 def same_number(a: str, b: str) -> bool:

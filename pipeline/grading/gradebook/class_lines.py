@@ -148,7 +148,7 @@ class ClassRow:
     @property
     def version(self) -> str:
         """Version of all that is known of the submission, as in `Entry.whole_version`."""
-        return f"{self.grading}.{max(self.made_of[2:], default=0)}"
+        return f"{self.grading}.{max(self.made_of[2:], default=0)}.{int(self.shared is not None)}"
 
 
 @dataclass(frozen=True, kw_only=True)

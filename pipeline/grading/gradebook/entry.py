@@ -100,8 +100,13 @@ class Entry:
 
     @property
     def whole_version(self) -> str:
-        """Version of all that is known of the submission: it changes with every event."""
-        return f"{self.grading}.{max((event.id for event in self.events), default=0)}"
+        """Version of all that is known of the submission.
+
+        It changes with every event, and when recordings are found to be shared.
+        """
+        newest = max((event.id for event in self.events), default=0)
+        is_shared = any(flag.code == "shared_data" for flag in self.graded.flags)
+        return f"{self.grading}.{newest}.{int(is_shared)}"
 
     def request_version(self, criterion: str) -> str:
         """Return the version of a request, which an answer must name."""

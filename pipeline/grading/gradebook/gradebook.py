@@ -75,7 +75,7 @@ from pipeline.words.progress import silent
 if TYPE_CHECKING:
     import pandas as pd
 
-State = tuple[int, int]
+State = tuple[int, int, int]
 
 _SUGGESTED = 4  # names of submissions in one suggestion
 _MOST_SHOWN = 50  # requests of each kind on one page
@@ -421,7 +421,9 @@ class Gradebook:
         """Return numbers that change whenever the content of the gradebook changes."""
         with self._database.reading() as connection:
             last = self._last(connection).id
-            return last, connection.scalar(select(func.max(events.c.id))) or 0
+            mine = select(func.count()).where(entries.c.batch_id == last)  # fewer after an erasure
+            newest = connection.scalar(select(func.max(events.c.id)))
+            return last, newest or 0, connection.scalar(mine) or 0
 
     def class_now(self, before: ClassNow | None = None) -> ClassNow:
         """Return the class with current grades.
@@ -437,11 +439,13 @@ class Gradebook:
             keys = first_keys(connection, members)
             known = before.rows if before and before.rubric == rubric else ()
             made = {row.made_of: row for row in known}
-            columns = gradings.c.id, gradings.c.submission_id
+            columns = gradings.c.id, gradings.c.at, gradings.c.submission_id
             made_of = {
-                row.position: (row.id, row.shared, *(e.id for e in done.get(row.submission_id, ())))
+                row.position: (
+                    (row.id, row.at), row.shared, *(e.id for e in done.get(row.submission_id, ()))
+                )
                 for row in connection.execute(class_list(last, *columns))
-            }
+            }  # fmt: skip
             listed = {at: made[of] for at, of in made_of.items() if of in made}
             rows = class_list(last)
             if listed:

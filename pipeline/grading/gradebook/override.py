@@ -96,7 +96,8 @@ def read_wishes(path: Path, *, why: str = "") -> list[WantedPoints]:
             + (f"; it lacks {', '.join(missing)}" if missing else "")
         )
     criteria = [name for name in table.columns if name and name not in _HEADS]
-    wishes = []
+    wishes: list[WantedPoints] = []
+    seen: dict[tuple[str, str], int] = {}
     for line, row in table.iterrows():
         cells = {str(name): str(cell).strip() for name, cell in row.items()}
         asked = {name: cells[name] for name in criteria if cells[name]}
@@ -108,6 +109,10 @@ def read_wishes(path: Path, *, why: str = "") -> list[WantedPoints]:
             except ConfigError as error:
                 at = "" if by_row else f", column {criterion}"
                 raise ConfigError(f"{path.name} line {line}{at}: {error}") from None
+            first = seen.setdefault((cells["submission"], criterion), int(str(line)))
+            if first != int(str(line)):
+                who = f"{cells['submission']}, {criterion}"
+                raise ConfigError(f"{path.name} line {line}: {who} is already in line {first}")
             wishes.append(
                 WantedPoints(
                     submission=cells["submission"],

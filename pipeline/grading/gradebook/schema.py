@@ -122,6 +122,7 @@ gradings = Table(
     Column("fingerprints", LargeBinary, nullable=False),
     Index("gradings_by_key", "key"),
     Index("gradings_by_submission", "submission_id"),
+    sqlite_autoincrement=True,  # no number is given twice, even after an erasure
 )
 
 figures = Table(
@@ -184,6 +185,7 @@ events = Table(
     Column("authors", Names, nullable=False),
     Index("events_by_submission", "submission_id"),
     Index("events_by_assignment", "assignment"),
+    sqlite_autoincrement=True,  # no number is given twice, even after an erasure
 )
 
 _REFUSE = "entries of a gradebook cannot be changed"

@@ -8,9 +8,12 @@ import hashlib
 import json
 import shutil
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 from pipeline.errors import ConfigError
 from pipeline.output import own_folder, write_file
@@ -18,6 +21,7 @@ from pipeline.submission.load import MAX_TOML_BYTES, NAME
 
 FOLDER = "repairs"
 _LATEST, _ORIGINAL, _REPAIR, _RUN = "latest", "original.toml", "repair.json", "run.json"
+_DAMAGED = OSError, ValueError, TypeError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +55,8 @@ def read_repairs(out: Path, name: str) -> dict[str, Repair]:
     """Return the repairs of a submission, by the key of the text that each one replaces."""
     found = {}
     for path in sorted((out / FOLDER / name).glob(f"*/{_REPAIR}")):
-        found[path.parent.name] = Repair(**json.loads(path.read_text("utf-8")))
+        with suppress(*_DAMAGED):
+            found[path.parent.name] = Repair(**json.loads(path.read_text("utf-8")))
     return found
 
 
@@ -71,7 +76,7 @@ def read_original(out: Path, name: str) -> str | None:
     try:
         key = (folder / _LATEST).read_text("utf-8")
         return (folder / key / _ORIGINAL).read_bytes().decode()
-    except FileNotFoundError:
+    except (OSError, ValueError):
         return None
 
 
@@ -94,16 +99,17 @@ def save_repair(out: Path, name: str, repair: Repair, *, of: str) -> None:
 
 def save_run(out: Path, run: Run) -> None:
     """Save what was graded, so that the class can be graded again at the desk."""
-    _write(own_folder(out, FOLDER) / _RUN, json.dumps(asdict(run), ensure_ascii=False))
+    _write(out / _RUN, json.dumps(asdict(run), ensure_ascii=False))
+    if (old := out / FOLDER / _RUN).is_file():  # its place was among the submissions' folders
+        old.unlink()
 
 
 def read_run(out: Path) -> Run | None:
     """Return what was graded last; None if this is not known or cannot be read."""
-    try:
-        plain = json.loads((out / FOLDER / _RUN).read_text("utf-8"))
-        return Run(**{**plain, "paths": tuple(plain["paths"])})
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+    for file in (out / _RUN, out / FOLDER / _RUN):
+        with suppress(*_DAMAGED):
+            return TypeAdapter(Run).validate_json(file.read_bytes())
+    return None
 
 
 def forget_repairs(out: Path, names: Iterable[str]) -> None:

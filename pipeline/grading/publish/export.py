@@ -293,10 +293,12 @@ def _place(
     served = placed.values() if platform.is_by_upload else guessed
     reached = {student.grade.submission for student in served}
     lost = [student for student in lost if student.grade.submission not in reached]
+    by_number = [] if platform.is_by_upload or has_roster else placed.values()
     remarks = about(
         "only the account that submitted gets the page; if these are groups, do not upload the "
         "zip, and give the worksheet with --roster",
-        (f"{s.name} ({s.grade.submission})" for s in guessed if not platform.is_by_upload),
+        (f"{student.name} ({student.grade.submission})" for student in by_number),
+        most=_NAMED,
     )
     remarks += not_exported(platform.feedback_needs, lost)
     return placed, remarks + not_exported("another file has the same name", twice)

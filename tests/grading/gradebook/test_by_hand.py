@@ -218,6 +218,9 @@ def test_points_come_from_a_table(tmp_path):
     table.write_text("submission,discussion,why\nteam-1,good,well done\n", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"line 2, column discussion: good: "):
         read_wishes(table)
+    table.write_text("submission,laws\nteam-1,1\nteam-2,1\nteam-1,2\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"line 4: team-1, laws is already in line 2"):
+        read_wishes(table, why="x")
 
 
 def test_check_rubric_shows_a_manual_criterion():

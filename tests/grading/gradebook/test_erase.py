@@ -9,6 +9,7 @@ import pytest
 from sqlalchemy import Engine, create_engine, text
 from sqlalchemy.exc import DBAPIError
 
+from pipeline.desk.gradebooks import Gradebooks
 from pipeline.grading.gradebook.database import FILE
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.platforms import PLATFORMS
@@ -107,6 +108,24 @@ def test_no_row_in_postgresql_keeps_a_trace(server, place_in_postgresql):
     engine.dispose()
     tables = Path(url.partition("host=")[2], "data", "base").rglob("*")
     assert [path for path in tables if path.is_file() and _found(path.read_bytes())] == []
+
+
+def test_a_number_of_an_erased_grading_is_not_used_again(tmp_path):
+    """A desk that is open during an erasure shows and accepts no other grade for the new team."""
+    desk = Gradebooks()
+    with Gradebook(tmp_path, create=True) as book:
+        finish(book, make_grade("alice"), make_grade("zoe"))
+    seen = desk.of(tmp_path).teams["zoe"].version
+    with Gradebook(tmp_path) as book:
+        book.erase(["zoe"])
+    assert list(desk.of(tmp_path).teams) == ["alice"]
+    with Gradebook(tmp_path) as book:
+        again = make_grade("zoe", share=0.2, authors=("mallory",))
+        finish(book, make_grade("alice"), make_outcome(again, key="other"))
+        shown = desk.of(tmp_path).teams["zoe"]
+        assert (shown.line.points, shown.line.authors) == (again.points, ("mallory",))
+        assert shown.version != seen
+        assert book.accept_all({"zoe": seen}, by="Ada").teams == 0
 
 
 def test_a_backup_of_a_file_is_the_same_gradebook(tmp_path):

@@ -323,6 +323,18 @@ def test_teams_are_accepted_together_as_they_were_seen(book):
     assert book.accept_all({"gone": "1.0"}, by="Ada").teams == 0
 
 
+def test_a_team_whose_recordings_turn_out_to_be_shared_is_not_accepted(book):
+    """A flag of the class list is part of what a person saw."""
+    class_ = make_grade("team-1"), make_grade("team-2")
+    finish(book, *class_)
+    seen = {row.submission: row.version for row in book.class_now().rows}
+    finish(book, *class_, shared={"team-2": shared_flag("team-1")})
+    done = book.accept_all(seen, by="Ada")
+    assert (done.teams, done.kept) == (1, ("team-2",))
+    assert all(row.version == book.entry(row.submission).whole_version
+               for row in book.class_now().rows)  # fmt: skip
+
+
 def test_rows_are_only_added(book, place):
     """The database itself refuses to change or delete rows of any table."""
     graded = make_grade("team-3", flags=(hertz_flag(),))

@@ -87,9 +87,23 @@ def test_an_erased_submission_is_no_path_of_the_last_grading_any_more(tmp_path):
     assert read_run(tmp_path) == Run(paths=("/lab/zebra-2", "/lab"), rubric="lab.toml")
 
 
-@pytest.mark.parametrize("spoilt", ["", "{", "[]", '{"rubric": "lab.toml"}', '{"paths": []}'])
+@pytest.mark.parametrize("spoilt", ["", "[]", '{"paths": []}', '{"paths": [1], "rubric": "r"}'])
 def test_a_spoilt_note_of_the_last_grading_is_no_note(spoilt, tmp_path):
     """If the file about the last grading is damaged, nothing is known about that grading."""
     save_run(tmp_path, Run(paths=("/lab",), rubric="lab.toml"))
-    (tmp_path / FOLDER / "run.json").write_text(spoilt, encoding="utf-8")
+    (tmp_path / "run.json").write_text(spoilt, encoding="utf-8")
     assert read_run(tmp_path) is None
+    (tmp_path / FOLDER / "team-07" / "k").mkdir(parents=True)
+    (tmp_path / FOLDER / "team-07" / "k" / "repair.json").write_text(spoilt, encoding="utf-8")
+    (tmp_path / FOLDER / "team-07" / "latest").write_bytes(b"\xff")
+    assert read_repairs(tmp_path, "team-07") == {}
+    assert read_original(tmp_path, "team-07") is None
+
+
+def test_a_submission_with_the_name_of_a_file_of_the_class_blocks_nobody(tmp_path):
+    """A student's folder may have any name."""
+    keep_original(tmp_path, "run.json", "[submission")
+    run = Run(paths=("/lab",), rubric="lab.toml")
+    save_run(tmp_path, run)
+    assert read_run(tmp_path) == run
+    assert read_original(tmp_path, "run.json") == "[submission"
