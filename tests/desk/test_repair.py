@@ -132,12 +132,17 @@ def test_an_anonymous_class_shows_no_file(handed_in, tmp_path):
 
 
 def test_a_run_keeps_the_options_that_decide_its_result(tmp_path):
-    """What was graded is kept with its limits and its choice of figures. Older files lack them."""
+    """What was graded is kept with its limits and its choice of figures.
+
+    Older files lack them,
+    and are in another place.
+    """
     options = Options(time_limit=7.0, memory_limit=2_000_000_000, figures=False, anonymous=True)
     run = Run(paths=("a",), rubric="r.toml", options=options.lasting())
     (tmp_path / FOLDER).mkdir()
     save_run(tmp_path, run)
     assert read_run(tmp_path) == run
     assert Options(**run.options) == options
+    (tmp_path / "run.json").unlink()
     (tmp_path / FOLDER / "run.json").write_text('{"paths": ["a"], "rubric": "r.toml"}')
     assert read_run(tmp_path) == Run(paths=("a",), rubric="r.toml")
