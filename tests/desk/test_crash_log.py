@@ -168,6 +168,6 @@ def test_what_ends_a_desk_is_reported(sent, status, told, tmp_path):
             desk.terminate()
             _, said, _ = ended()
         assert (
-            f"an earlier desk was killed or crashed. Files are intact. The log says when, and "
-            f"after a crash in a library also where: {tmp_path}" in said
+            "an earlier desk was killed or crashed. Saved files are intact; its last change may "
+            f"be missing. The log says where a library crashed: {tmp_path}" in said
         ) == again

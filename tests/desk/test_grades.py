@@ -735,6 +735,16 @@ def test_one_decision_for_several_teams_is_previewed(ta, grades):
             assert criterion(entry.grade, "laws").message == f"{said} Mind the unit."
 
 
+def test_the_result_is_shown_before_a_decision_also_without_scripts(ta):
+    """A form that is sent by "get" has only its fields, not the query of its address."""
+    page = ta.get(together(points="0.5"))
+    form = page.text.partition('class="together"')[2].partition("</form>")[0]
+    hidden = re.findall(r'<input type="hidden" name="([^"]*)" value="([^"]*)">', form)
+    fields = [(unescape(name), unescape(value)) for name, value in hidden]
+    fields += [("points", "0.5"), *(("team", name) for name in listed(page))]
+    assert listed(ta.get(f"{ROOM}together?{urlencode(fields)}")) == listed(page)
+
+
 def test_a_decision_applies_to_all_teams_or_none(ta, grades):
     """If one decision for several teams is not possible for all of them, no team changes."""
     page = ta.get(together())

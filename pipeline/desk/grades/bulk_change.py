@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from typing import Any
-from urllib.parse import urlencode
+from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
@@ -169,6 +169,7 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
         status=status,
         title=_name_set(wanted),
         action=_address(ask, done=""),
+        asked_for=parse_qsl(urlsplit(_address(ask, done="")).query),
         done=ask.query("done"),
         criterion=capital(asked.title or asked.id),
         out_of=points_text(asked.points),

@@ -214,7 +214,7 @@ def _show_page(
         person_lines=person_lines(grade),
         total=_describe_total(ask, now, wrong=wrong),
         seen=now.reviewed_by,
-        version=now.whole_version,
+        whole_version=now.whole_version,
         items=_link_items(ask, name, items, chosen),
         doubts=sum(item.doubt for item in items),
         events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
