@@ -56,8 +56,8 @@ class CrashLog:
             self._file = open(self.log, "ab", buffering=0, opener=_open_private)
         if killed:
             self.killed = (
-                "an earlier desk was killed or crashed. Saved files are intact; its last change may be "
-                f"missing. The log says where a library crashed: {self.log}"
+                "an earlier desk was killed or crashed. Saved files are intact; its last change "
+                f"may be missing. The log says where a library crashed: {self.log}"
             )
             for process in killed:
                 self._note(f"{_ENDS} was killed or crashed before it could say why", process)
