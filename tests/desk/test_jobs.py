@@ -188,8 +188,8 @@ def test_a_file_that_ends_the_process_fails_only_its_row(tmp_path):
             until(grown)
             reading[0].kill()
             text = page.result().text
-        names = re.findall(r'<tr id="file-[^>]*>\n<th scope="row">(.*?)<', text)
-        rows = dict(zip(names, text.split('<tr id="file-')[1:], strict=True))
+        names = re.findall(r'<tr [^>]*id="file-.*>\n<th scope="row">(.*?)<', text)
+        rows = dict(zip(names, re.split(r'<tr [^>]*id="file-', text)[1:], strict=True))
         assert {name for name, row in rows.items() if "the process ended" in row} == {"large.csv"}
         assert len(rows) == 3
         (tmp_path / "data" / "large.csv").unlink()
