@@ -568,10 +568,6 @@ def test_the_export_equals_that_of_the_command(ta, grades, tmp_path, platform):
 # ------------------------------------------------------------------------------- anonymous
 
 
-@pytest.mark.slow
-@pytest.mark.sample
-@pytest.mark.slow
-@pytest.mark.sample
 @pytest.mark.parametrize("anonymous", [False, True])
 def test_the_form_to_grade_again_knows_what_was_graded(tmp_path, anonymous):
     """It shows paths, rubric and late days of the last grading; hidden names stay hidden."""
@@ -586,6 +582,8 @@ def test_the_form_to_grade_again_knows_what_was_graded(tmp_path, anonymous):
         assert ("as last time (2)" in page.text) is anonymous
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("anonymous", [False, True])
 def test_a_class_is_graded_again_from_the_desk(tmp_path, anonymous):
     """A late submission is graded into the open class; earlier grades and hidden names stay."""
