@@ -164,7 +164,7 @@ def test_grading_writes_only_into_its_folder_and_makes_no_connection(graded):
     assert not Path("/tmp/escaped").exists()
     out = base / "out-school"
     assert sorted(path.name for path in out.iterdir()) == [
-        ".lock", "class.html", "feedback", "gradebook.sqlite", "grades.csv", "repairs",
+        ".lock", "class.html", "feedback", "gradebook.sqlite", "grades.csv", "repairs", "run.json",
     ]  # fmt: skip
     assert not list(base.glob("escaped*"))
 
