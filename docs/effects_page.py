@@ -37,7 +37,7 @@ def effects_page() -> str:
     """Return the page in Markdown, with all words taken from the catalogue."""
     head = [
         "# The effects",
-        "<!-- written by python -m docs.codegen -->",
+        "<!-- written by python -m docs.effects_page -->",
         _wrapped(phrases("effects").text("effects")),
         _wrapped(
             "[`cartlab gap`](gap.md) looks for these effects. To simulate a bench with one of "

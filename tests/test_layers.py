@@ -50,6 +50,7 @@ HOMES = {
     "starlette": ("web", "bench", "desk"),
     "uvicorn": ("web",),
     "control": ("plant", "notebook"),
+    "sympy": ("plant.simulator.codegen",),
     "sqlalchemy": ("grading.gradebook",),
     "pandas": ("report", "grading", "notebook"),
 }

@@ -1,6 +1,7 @@
 """The catalogue of effects: behaviour of a bench beyond the linear chain.
 
-To add an effect: write an `Effect` here, list it in `CATALOGUE`, and run `python -m docs.codegen`.
+To add an effect: write an `Effect` here, list it in `CATALOGUE`, and run
+`python -m pipeline.plant.simulator.codegen`.
 """
 
 import re

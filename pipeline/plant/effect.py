@@ -34,7 +34,8 @@ from pipeline.words.math import (
 # body. `on` is 1 while the drive is powered, otherwise 0. `z` is an internal state of the law. All
 # other names are symbols of parameters. The functions are abs, sign, exp, sin, cos, min, max, clip.
 #
-# `python -m docs.codegen` generates compiled code from the laws, with all derivatives.
+# `python -m pipeline.plant.simulator.codegen` generates compiled code from the laws, with all
+# derivatives.
 
 
 @dataclass(frozen=True)

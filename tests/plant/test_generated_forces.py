@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from docs.codegen.__main__ import MADE, ROOM
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.effect import ContactLaw, Effect, ForceLaw, FrictionLaw, HysteresisLaw, evaluate
 from pipeline.plant.simulator import generated_forces, terms
+from pipeline.plant.simulator.codegen import FOLDER, GENERATED
 from pipeline.plant.simulator.tables import TABLES
 from pipeline.words.math import to_tex
 
@@ -17,11 +17,11 @@ FOLLOWED = [e for e in CATALOGUE if isinstance(e.law, ForceLaw | FrictionLaw | C
 STATES = [(0.4, 0.7, 0.02, 1.0), (-0.9, -0.3, -0.05, 1.0), (1.3, -1.1, 0.03, 0.0)]  # x, v, u, on
 
 
-@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("name", GENERATED)
 def test_generated_files_are_up_to_date(name):
-    """The generated files are what `python -m docs.codegen` writes from the laws."""
-    stored, made = (ROOM / name).read_text(encoding="utf-8"), MADE[name](CATALOGUE)
-    assert ast.dump(ast.parse(stored)) == ast.dump(ast.parse(made)), "run python -m docs.codegen"
+    """The generated files are what `pipeline.plant.simulator.codegen` writes from the laws."""
+    stored, made = (FOLDER / name).read_text(encoding="utf-8"), GENERATED[name](CATALOGUE)
+    assert ast.dump(ast.parse(stored)) == ast.dump(ast.parse(made))
 
 
 def coordinates_of(effect: Effect) -> np.ndarray:

@@ -10,9 +10,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import pipeline
-from docs.codegen.__main__ import MADE
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.effect import Effect, EffectParameter, ForceLaw, FrictionLaw, HysteresisLaw
+from pipeline.plant.simulator.codegen import GENERATED
 
 ROOM = Path(pipeline.__file__).parent
 CUBIC_DRAG = Effect(
@@ -52,7 +52,7 @@ def kinds_of(source: str, name: str) -> dict[str, int]:
 @pytest.fixture(scope="module")
 def made() -> dict[str, str]:
     """Return the generated source for a catalogue with one more effect."""
-    return {name: source((*CATALOGUE, CUBIC_DRAG)) for name, source in MADE.items()}
+    return {name: source((*CATALOGUE, CUBIC_DRAG)) for name, source in GENERATED.items()}
 
 
 def test_columns_force_and_derivatives_are_generated(made):
@@ -102,5 +102,5 @@ def test_only_its_own_file_names_an_effect(effect):
         for path in (ROOM / room).rglob("*.py")
         if re.search(rf"\b({effect.key}|{effect.key.upper()}\w*)\b", path.read_text("utf-8"))
     }
-    allowed = {f"plant/simulator/{name}" for name in MADE} | {"gap/pem/fit.py"}
+    allowed = {f"plant/simulator/{name}" for name in GENERATED} | {"gap/pem/fit.py"}
     assert files - {"plant/catalogue.py"} <= allowed

@@ -10,7 +10,7 @@ from tests.helpers.places import ROOT
 def test_the_page_of_effects_is_the_catalogue():
     """`docs/effects.md` is what `docs/effects_page.py` writes, and each effect has its picture."""
     page = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
-    assert page == effects_page(), "run python -m docs.codegen"
+    assert page == effects_page(), "run python -m docs.effects_page"
     pictures = {path.stem for path in (ROOT / "docs" / IMAGES).iterdir()}
     assert pictures == {effect.key for effect in CATALOGUE}
 

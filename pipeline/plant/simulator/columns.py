@@ -1,6 +1,6 @@
 """The columns of the simulator's tables.
 
-Made by `python -m docs.codegen` from the laws of the effects.
+Made by `python -m pipeline.plant.simulator.codegen` from the laws of the effects.
 """
 
 from enum import IntEnum

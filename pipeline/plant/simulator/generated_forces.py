@@ -1,6 +1,6 @@
 """The laws of the effects, for the compiled simulators.
 
-Made by `python -m docs.codegen` from the laws of the effects.
+Made by `python -m pipeline.plant.simulator.codegen` from the laws of the effects.
 """
 
 from math import cos, exp, inf, pi, sin

@@ -1,6 +1,6 @@
 """The laws of the effects in the coordinates of a fit, with derivatives.
 
-Made by `python -m docs.codegen` from the laws of the effects.
+Made by `python -m pipeline.plant.simulator.codegen` from the laws of the effects.
 """
 
 from enum import IntEnum

@@ -1,16 +1,23 @@
-"""Write source code that simulates the effects' laws, with all derivatives.
+"""Write `columns.py`, `generated_forces.py` and `terms.py`, the code made from the effects' laws.
 
-Every law is differentiated symbolically, and printed for the compiler twice: in the parameters that
-the simulator's tables hold, and in those of the prediction-error fit (`FitCoordinates`).
+Run it as `python -m pipeline.plant.simulator.codegen`. It needs sympy and ruff, which only
+developers have, and no other module imports it. Every law is differentiated symbolically, and
+printed for the compiler twice: in the parameters that the simulator's tables hold, and in those of
+the prediction-error fit (`FitCoordinates`).
 """
 
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from math import isfinite
+from pathlib import Path
 from typing import Any
 
 import sympy
 from sympy.printing.pycode import PythonCodePrinter
 
+from pipeline.output import write_file
+from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.effect import (
     ContactLaw,
     Effect,
@@ -23,7 +30,11 @@ from pipeline.plant.effect import (
 
 Expr = Any  # sympy's own annotations are partial
 
-_HEAD = '"""{}\n\nMade by `python -m docs.codegen` from the laws of the effects.\n"""\n\n'
+_HEAD = (
+    '"""{}\n\n'
+    "Made by `python -m pipeline.plant.simulator.codegen` from the laws of the effects.\n"
+    '"""\n\n'
+)
 _MASKS = {"cart": "ON_CARTS", "spring": "ON_SPRINGS", "input": "ON_DRIVE"}
 _TABLES = {"cart": "Cart", "spring": "Spring", "input": "Drive"}
 _AT = {"cart": "cart[i, {}]", "spring": "spring[j, {}]", "input": "drive[{}]"}
@@ -469,3 +480,25 @@ def _coefficients(effect: Effect, catalogue: Sequence[Effect]) -> tuple[int, ...
         if all(sympy.simplify(bend) == 0 for bend in bends):
             mine.append(one)
     return tuple(i for i, one in enumerate(coordinates) if one in mine)
+
+
+# ------------------------------------------------------------------- the files
+
+FOLDER = Path(__file__).parent
+GENERATED = {
+    "columns.py": columns_source,
+    "generated_forces.py": forces_source,
+    "terms.py": terms_source,
+}
+
+
+def main() -> None:
+    """Write each file."""
+    for name, source in GENERATED.items():
+        write_file(FOLDER / name, source(CATALOGUE))
+    files = [str(FOLDER / name) for name in GENERATED]
+    subprocess.run([sys.executable, "-m", "ruff", "format", "--quiet", *files], check=True)
+
+
+if __name__ == "__main__":
+    main()

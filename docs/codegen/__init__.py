@@ -1,1 +1,0 @@
-"""Writes what is made from the effects' laws: `python -m docs.codegen`."""
