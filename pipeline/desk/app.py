@@ -19,7 +19,14 @@ from starlette.routing import Route
 
 from pipeline.desk.bench import bench_page
 from pipeline.desk.flow import limit_each_person
-from pipeline.desk.grades import bulk_change, class_actions, class_table, request_queue, team_page
+from pipeline.desk.grades import (
+    bulk_change,
+    class_actions,
+    class_table,
+    grading_form,
+    request_queue,
+    team_page,
+)
 from pipeline.desk.home import enter, open_place, show_folders, show_home
 from pipeline.desk.instructor import exercise_pages, rubric_editor, rubric_preview_page
 from pipeline.desk.login import PAGE_HEADERS, JupyterLogin, ProxyLogin, SecretLogin, limit_bodies
@@ -153,6 +160,8 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/solution/{n:nth}/", "GET", exercise_pages.show_solution),
     ("/solution/{n:nth}/make", "POST", _start("make_solution", "The solution")),
     ("/solution/{n:nth}/{name:path}", "GET", _serve("solution")),
+    ("/grading/", "GET", grading_form.show_new),
+    ("/grading/", "POST", grading_form.grade_new),
     ("/grades/{n:nth}/", "GET", class_table.show),
     ("/grades/{n:nth}/events", "GET", _stream_events),
     ("/grades/{n:nth}/news", "GET", class_table.show_news),
@@ -176,7 +185,7 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/grades/{n:nth}/import", "POST", class_actions.take_table),
     ("/grades/{n:nth}/export", "POST", class_actions.export_class),
     ("/grades/{n:nth}/publish", "POST", _start("publish_grades", "Writing", then="#work")),
-    ("/grades/{n:nth}/regrade", "POST", class_actions.regrade),
+    ("/grades/{n:nth}/grade", "POST", class_actions.grade),
     ("/grades/{n:nth}/stop", "POST", _stop),
 )  # fmt: skip
 

@@ -58,6 +58,12 @@ def find_root() -> Path:
     return here if here != Path(here.anchor) else Path.home()
 
 
+def free_path(folder: Path, name: str) -> Path:
+    """Return a path in a folder that is not taken yet; a number is added to the name if needed."""
+    names = (name, *(f"{name}-{number}" for number in range(2, 1_000)))
+    return next(folder / one for one in names if not (folder / one).exists())
+
+
 def list_folders(root: Path, inside: str) -> FolderList:
     """Return the folders inside one folder; submissions and gradings come first.
 

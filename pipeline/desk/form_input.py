@@ -1,6 +1,8 @@
 """Read what people type into a form: a path on this computer, or a number."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.errors import ConfigError
@@ -66,6 +68,20 @@ def read_number(
     bounds = f" above {above:g}" if above > -math.inf else ""
     bounds += f" and below {below:g}" if below < math.inf else ""
     raise ConfigError(f"{name}: expected a number{bounds}, found {_clip(typed, most=20)!r}")
+
+
+@contextmanager
+def keep_refusal(name: str, wrong: dict[str, str]) -> Iterator[None]:
+    """Keep the reason for which a field of a form is refused.
+
+    Parameters
+    ----------
+    wrong : receives the reason, under the name of the field.
+    """
+    try:
+        yield
+    except ConfigError as error:
+        wrong[name] = str(error).removesuffix(" with --out")
 
 
 def _clip(typed: str, *, most: int) -> str:

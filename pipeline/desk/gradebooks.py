@@ -78,8 +78,6 @@ class Gradebooks:
     def __init__(self) -> None:
         # Name of the person who changes points, unless a proxy states it.
         self.signed = _find_user()
-        # By gradebook: submissions and options of the last regrading.
-        self.asked: dict[Path | str, dict[str, str]] = {}
         self._books: dict[Path | str, Gradebook] = {}
         self._classes: dict[Path | str, ClassView] = {}
         self._drawn: dict[tuple[Path | str, str], tuple[State, Any]] = {}

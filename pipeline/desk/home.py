@@ -128,15 +128,20 @@ def _describe_submission(ask: PageRequest, n: int, folder: Path) -> dict[str, An
 
 
 def _describe_class(ask: PageRequest, n: int, place: Place) -> dict[str, Any]:
-    """Return how many teams of a class were reviewed; all numbers are 0 if it cannot be read."""
+    """Return the state of a class: whether work is running there, and how many were reviewed.
+
+    All numbers are 0 if the class cannot be read, or is not graded yet.
+    """
     try:
         teams = ask.desk.gradebooks.of(place).now.rows
     except (PipelineError, OSError):
         teams = ()
+    job = ask.desk.jobs.of(place) if isinstance(place, Path) else None
     return {
         "n": n,
         "name": name_place(place),
         "place": place,
+        "is_running": job is not None and not job.over,
         "teams": len(teams),
         "seen": sum(1 for team in teams if team.reviewed_by),
     }

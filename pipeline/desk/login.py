@@ -24,6 +24,7 @@ PAGE_HEADERS = {
 }
 JUPYTER_SECRET = "X-Cartlab-Secret"
 MOST_FORM = 2_000_000  # bytes of a request that is not an upload
+_UPLOADS = "/files", "/grade", "/grading/"  # ends of the addresses of uploads
 
 
 class SecretLogin:
@@ -142,11 +143,11 @@ def limit_bodies(app: ASGIApp, *, uploads: int) -> ASGIApp:
 
     Parameters
     ----------
-    uploads : largest number of bytes of an upload, whose address ends in /files.
+    uploads : largest number of bytes of an upload, whose address has an end of `_UPLOADS`.
     """
 
     async def limited(scope: Scope, receive: Receive, send: Send) -> None:
-        most = left = uploads if scope["path"].endswith("/files") else MOST_FORM
+        most = left = uploads if scope["path"].endswith(_UPLOADS) else MOST_FORM
         too_much = f"too much data in one request: at most {most:,} bytes"
 
         async def count() -> Message:

@@ -7,7 +7,9 @@ from pipeline.desk.users import Place, User, name_place
 
 _BESIDE = 3  # other open places to which every page has a link; the first page lists all
 _OF_FOLDERS = ("student", "bench", "solution")
-_WHOLE = {"exercises": "Exercises", "rubric": "Rubric", "effects": "Effects"}
+_WHOLE = {
+    "exercises": "Exercises", "rubric": "Rubric", "effects": "Effects", "grading": "Grading",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

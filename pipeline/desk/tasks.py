@@ -18,7 +18,7 @@ from pipeline.desk.exercises import (
     make_exercises,
     make_solution,
 )
-from pipeline.desk.form_input import read_path
+from pipeline.desk.form_input import keep_refusal, read_path
 from pipeline.desk.last_report import FINDINGS, PLOTS_OF, stat_sources
 from pipeline.desk.student.folder_tasks import FOLDER_TASKS
 from pipeline.errors import ConfigError, SubmissionError
@@ -245,7 +245,42 @@ def publish_grades(folder: str, *, progress: Progress) -> None:
         write_outputs(book, out)
 
 
-def regrade_class(
+def check_grading(
+    files: Sequence[str],
+    paths: Sequence[str],
+    rubric: str,
+    lateness: str,
+    skip: str,
+    *,
+    progress: Progress,
+) -> dict[str, str]:
+    """Return why a grading cannot start, by field of its form.
+
+    Parameters
+    ----------
+    files : uploaded archives.
+    skip : folder of the class, whose content is not graded; "" if there is no such folder.
+    """
+    from pipeline.grading.intake.find import check_hand_ins
+    from pipeline.grading.intake.late_table import read_late_table
+    from pipeline.grading.rubric_file import load_rubric
+
+    wrong: dict[str, str] = {}
+    for name, given in (("files", files), ("paths", paths)):
+        with keep_refusal(name, wrong):
+            for path in given:
+                check_hand_ins(Path(path), skip=[Path(skip)] if skip else [])
+    with keep_refusal("rubric", wrong):
+        if not rubric:
+            raise ConfigError("choose a rubric, or enter a file")
+        load_rubric(Path(rubric))
+    with keep_refusal("lateness", wrong):
+        if lateness:
+            read_late_table(Path(lateness))
+    return wrong
+
+
+def grade_submissions(
     folder: str,
     paths: Sequence[str],
     rubric: str,
@@ -314,7 +349,8 @@ TASKS: Mapping[str, Callable[..., Any]] = {
     task.__name__: task
     for task in (
         *FOLDER_TASKS, describe_file, list_files, list_not_read, fill_tables, make_report, make_gap,
-        check_numbers, propose_recordings, weigh_recording, publish_grades, regrade_class,
+        check_numbers, propose_recordings, weigh_recording, publish_grades, check_grading,
+        grade_submissions,
         preview_rubric, check_exercise, draw_effect, make_exercises, make_solution,
         describe_exercise, make_plots, render_notes,
     )

@@ -29,7 +29,7 @@ _ROOMS: dict[Role, frozenset[str]] = {
     "instructor": _ALL
     | {"student", "grades", "solution", "effects", "exercises", "rubric", "bench"},
 }
-_ROOMS["owner"] = _ROOMS["instructor"] | {"open"}
+_ROOMS["owner"] = _ROOMS["instructor"] | {"open", "grading"}
 _ROOM_OF = {"folders": "student", "gradebooks": "grades", "workshop": "exercises", "ports": "bench",
             "grades": "feedback"}  # fmt: skip
 _NEEDS = {"exercises": "workshop", "rubric": "workshop", "bench": "ports"}

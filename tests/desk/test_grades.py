@@ -332,7 +332,7 @@ def test_forms_that_make_no_sense_change_nothing(ta, grades):
         assert ta.post(at("team-01"), **form).status in (400, 409, 422), form
     assert upload(ta, ROOM + "export", "roster", "a,b\n1,2\n", lms="canvas").status == 422
     assert ta.post(ROOM + "export", lms="blackboard").status == 400
-    assert ta.post(ROOM + "regrade", paths="", rubric="x").status == 422
+    assert ta.post(ROOM + "grade", paths="", rubric="x").status == 422
     change(ta, "team-02", points="0.5", why="alone")
     for moment in ("", "2026-01-01", "%"):  # times at which no decision was made in this class
         assert ta.post(ROOM + "together", do="undo", set=moment).status == 404
@@ -599,7 +599,7 @@ def test_a_class_is_graded_again_from_the_desk(tmp_path, anonymous):
         book.override("team-04", "pieces", 0.5, why="as told", by="Ada")
     with at_desk(opened=grades) as who:
         sent = {"paths": str(team), "rubric": str(lab), "lateness": str(late)}
-        assert who.post(ROOM + "regrade", **sent).status == 303
+        assert who.post(ROOM + "grade", **sent).status == 303
         until(lambda: "data-events" not in who.get(ROOM).text)
         shown = names(who.get(ROOM))
     run = read_run(grades)

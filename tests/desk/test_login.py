@@ -294,8 +294,8 @@ def test_students_and_tas_see_no_path_of_the_server(lab, root):
 
 # For each kind of page, the users of a lab server who may open it.
 ENTER = {"": "s t i w", "static": "s t i w", "student": "s i w", "grades": "t i w",
-         "solution": "i w", "effects": "i w", "open": "", "exercises": "w", "rubric": "w",
-         "bench": "w", "feedback": "s"}  # fmt: skip
+         "solution": "i w", "effects": "i w", "open": "", "grading": "", "exercises": "w",
+         "rubric": "w", "bench": "w", "feedback": "s"}  # fmt: skip
 
 
 @pytest.mark.parametrize("path", PATHS)

@@ -221,7 +221,7 @@ def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
         assert typed
         saved = visitor.post("/rubric/save", **kept, text=unescape(typed[1]))
         assert load_rubric(lab).late.percent_per_day == 50
-        assert 'action="/grades/0/regrade"' in visitor.get(saved.headers["location"]).text
+        assert 'action="/grades/0/grade"' in visitor.get(saved.headers["location"]).text
 
 
 def test_a_preview_of_an_anonymous_class_shows_no_name(tmp_path, lab):

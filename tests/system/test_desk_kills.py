@@ -142,7 +142,7 @@ class _Regrade(_Save):
         new = f"title {self.sent}"
         edit_submission(self.team, lambda document: document.update(title=new))
         sent = {"paths": str(self.team), "rubric": str(self.rubric), "lateness": ""}
-        assert who.post("/grades/0/regrade", **sent).status == 303
+        assert who.post("/grades/0/grade", **sent).status == 303
         until(lambda: "data-events" not in who.get("/grades/0/").text)
         page = who.get("/grades/0/").text
         assert "Grading: 1 of 1 graded" in page, re.findall('class="wrong".*', page)

@@ -1,6 +1,7 @@
 """Actions on a whole class: grade again, write files, change points from a table, export."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from starlette.datastructures import UploadFile
@@ -8,12 +9,13 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk.grades.class_table import may_release, open_gradebook, read_class
+from pipeline.desk.grades.class_table import show as show_class
+from pipeline.desk.grades.grading_form import grade_again, show_unfinished
 from pipeline.desk.grades.team_page import sign
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.scratch import scratch_folder
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.override import read_wishes
-from pipeline.grading.intake.repairs import read_run
 from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.export import export, export_feedback
 from pipeline.output import zip_bytes
@@ -92,34 +94,13 @@ def export_class(ask: PageRequest) -> Response:
     return _download(zip_bytes(files.items()), f"{platform.name}.zip", kind="application/zip")
 
 
-def regrade(ask: PageRequest) -> Response:
-    """Start the task that grades the class again; unchanged submissions keep their results."""
-    shown = read_class(ask)
-    if not ask.user.owns:
-        raise HTTPException(403, "only the owner of this computer can enter folders")
-    folder = ask.folder()
-    typed = {name: ask.text(name) for name in ("paths", "rubric", "lateness")}
-    run = read_run(folder)
-    paths = typed["paths"].splitlines() or (run.paths if run else ())
-    if not paths or not typed["rubric"]:
-        raise ConfigError("enter the submissions and the rubric")
-    ask.desk.gradebooks.asked[folder] = typed
-    ask.start(
-        "regrade_class",
-        title="Grading",
-        # The task works in another folder than the desk.
-        paths=[_find(path) for path in paths],
-        rubric=_find(typed["rubric"]),
-        lateness=_find(typed["lateness"]),
-        options={**(run.options if run else {}), "anonymous": shown.rubric.anonymous},
-    )
-    return ask.back(ask.here + "#work")
-
-
-def _find(typed: str) -> str:
-    """Return the whole path of an existing file or folder; other text as it is."""
-    path = Path(typed)
-    return str(path.resolve()) if typed and path.exists() else typed
+def grade(ask: PageRequest) -> Response:
+    """Grade the class again, or for the first time if an earlier attempt did not end."""
+    if not open_gradebook(ask).is_graded:
+        anonymous, refuse = bool(ask.text("anonymous")), partial(show_unfinished, ask)
+    else:
+        anonymous, refuse = read_class(ask).rubric.anonymous, partial(show_class, ask)
+    return grade_again(ask, anonymous=anonymous, refuse=refuse)
 
 
 def _store_upload(ask: PageRequest, name: str, path: Path) -> Path | None:

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
@@ -12,6 +11,7 @@ from starlette.responses import Response
 
 from pipeline.desk.gradebooks import ClassView
 from pipeline.desk.grades.filters import Filter
+from pipeline.desk.grades.grading_form import GradingForm, fill_form, show_unfinished
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing, show_own_page
 from pipeline.desk.users import name_place
@@ -20,7 +20,6 @@ from pipeline.grading.gradebook.class_lines import ClassRow
 from pipeline.grading.gradebook.events import TOTAL
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import to_the_second
-from pipeline.grading.intake.repairs import read_run
 from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.anonymous import STRANGER
 from pipeline.grading.publish.class_page import class_page, not_final
@@ -78,8 +77,15 @@ def may_release(ask: PageRequest) -> bool:
     return ask.user.role in ("instructor", "owner")
 
 
-def show(ask: PageRequest) -> Response:
-    """Show one page of the table of teams."""
+def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
+    """Show one page of the table of teams; or the first grading of the class, while it runs.
+
+    Parameters
+    ----------
+    form : the refused form to grade the class again.
+    """
+    if not open_gradebook(ask).is_graded:
+        return show_unfinished(ask)
     shown, wanted = read_class(ask), Filter.read(ask.request.query_params)
     chosen = wanted.chosen(shown)
     pages = max(1, -(-len(chosen) // _ROWS))
@@ -89,6 +95,7 @@ def show(ask: PageRequest) -> Response:
     unseen = Filter(seen="no").chosen(shown)
     return ask.page(
         "grades",
+        status=422 if form else 200,
         title=shown.rubric.title or name_place(ask.place_or_404()),
         teams=chosen[_ROWS * (page - 1) : _ROWS * page],
         points=points_text,
@@ -114,7 +121,7 @@ def show(ask: PageRequest) -> Response:
         to_page=lambda number: f"?{urlencode({'page': number})}&{wanted.query}",
         drawn="-".join(map(str, shown.state)),
         news=list_news(ask, shown, since=shown.state[1]),
-        asked=_find_run(ask, named=shown.names is None),
+        form=form or fill_form(ask, named=shown.names is None),
         n_requests=open_gradebook(ask).n_waiting(),
         released=open_gradebook(ask).released,
         may_release=may_release(ask),
@@ -133,20 +140,6 @@ def show_clean(ask: PageRequest) -> Response:
         titles={asked.id: capital(asked.title or asked.id) for asked in shown.rubric.criteria},
         signature=find_signature(ask),
     )
-
-
-def _find_run(ask: PageRequest, *, named: bool) -> dict[str, str]:
-    """Return what the form to grade again shows: what was typed last, or graded last.
-
-    The paths of an anonymous class may name teams, so only their number is shown.
-    """
-    place = ask.place_or_404()
-    run = read_run(place) if isinstance(place, Path) and ask.user.owns else None
-    last = {}
-    if run:
-        last = {"rubric": run.rubric, "lateness": run.lateness, "known": str(len(run.paths))}
-        last |= {"paths": "\n".join(run.paths)} if named else {}
-    return last | ask.desk.gradebooks.asked.get(place, {})
 
 
 def count_flags(shown: ClassView) -> list[Counted]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from pipeline.desk.gradebooks import ClassView
+from pipeline.desk.grades.grading_form import last_run
 from pipeline.desk.last_report import PLOTS, PLOTS_OF
 from pipeline.desk.page_request import PageRequest
 from pipeline.grading.gradebook.entry import Entry
@@ -55,7 +56,7 @@ def _list_candidates(ask: PageRequest, name: str) -> Iterator[Path]:
     """Yield folders that may be the submission: open ones, graded ones, or near the gradebook."""
     place = ask.place_or_404()
     yield from (folder for folder in ask.user.folders if folder.name == name)
-    for path in ask.desk.gradebooks.asked.get(place, {}).get("paths", "").splitlines():
+    for path in getattr(last_run(ask.user, place), "paths", ()):
         yield from (Path(path), Path(path) / name)
     if isinstance(place, Path):
         yield place.parent / name

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -27,6 +27,7 @@ from pipeline.desk.grades.criteria import (
     show_figures,
 )
 from pipeline.desk.grades.filters import Filter
+from pipeline.desk.grades.grading_form import start_grading
 from pipeline.desk.grades.recordings import find_recordings, list_papers, show_notes
 from pipeline.desk.jobs import Busy
 from pipeline.desk.page_request import PageRequest
@@ -134,7 +135,7 @@ def _repair(ask: PageRequest, shown: ClassView, team: ClassRow, *, by: str) -> R
     message = "Saved. It counts when the class is graded again."
     if run := read_run(place):
         with suppress(Busy):  # another job is running in this folder
-            ask.start("regrade_class", title="Grading", **asdict(run))
+            start_grading(ask, run, place)
             message = "Saved. The team is being graded again: load this page again in a moment."
     return ask.back(write_address(ask, team.line.submission), message)
 

@@ -1,7 +1,6 @@
 """The instructor's room: exercises with hidden effects, solutions, and the catalogue of effects."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -9,8 +8,9 @@ from urllib.parse import urlencode
 from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 
+from pipeline.desk.browse import free_path
 from pipeline.desk.exercises import SLIDE
-from pipeline.desk.form_input import read_path, read_whole_number
+from pipeline.desk.form_input import keep_refusal, read_path, read_whole_number
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
@@ -55,7 +55,7 @@ def _show_form(
         shown=list(zip(found["effects"], pictures, strict=True)),
         chosen=[one["key"] for one in found["effects"]],
         slide=SLIDE,
-        out=sent.get("out", str(_free_folder(ask.user.workshop or ask.desk.root))),
+        out=sent.get("out", str(free_path(ask.user.workshop or ask.desk.root, "exercise"))),
         folders=sent.get("folders", "1"),
         seed=sent.get("seed", "0"),
         reported=bool(sent.get("reported")),
@@ -73,13 +73,13 @@ def make(ask: PageRequest) -> Response:
     """Start the task that makes an exercise, or one for each team of a class."""
     bench, found = _check_exercise(ask)
     wrong = {"found": found["wrong"]} if found["wrong"] else {}
-    with _wrong_field("out", wrong):
+    with keep_refusal("out", wrong):
         out = new_folder(_read_folder(ask))
         if not out.parent.is_dir():
             raise ConfigError(f"{out}: the folder {out.parent} does not exist")
-    with _wrong_field("folders", wrong):
+    with keep_refusal("folders", wrong):
         folders = read_whole_number(ask.text("folders"), name="folders", least=1, most=500)
-    with _wrong_field("seed", wrong):
+    with keep_refusal("seed", wrong):
         seed = read_whole_number(ask.text("seed"), name="seed", least=0, most=2**31)
     if wrong:
         return _show_form(ask, bench, found, wrong=wrong)
@@ -158,12 +158,6 @@ def show_catalogue(ask: PageRequest) -> Response:
     return ask.page("effects", title="Effects beyond the linear chain", entries=entries)
 
 
-def _free_folder(root: Path) -> Path:
-    """Return the path of a new folder for an exercise."""
-    names = ("exercise", *(f"exercise-{number}" for number in range(2, 1_000)))
-    return next(root / name for name in names if not (root / name).exists())
-
-
 def _check_exercise(ask: PageRequest) -> tuple[dict[str, str], dict[str, Any]]:
     """Return the bench as typed, and the worker's check of the bench and its effects."""
     bench = _read_bench(ask)
@@ -191,15 +185,6 @@ def _read_bench(ask: PageRequest) -> dict[str, str]:
     if "preset" not in ask.sent:
         bench["preset"] = _SHOWN_ON
     return bench
-
-
-@contextmanager
-def _wrong_field(name: str, wrong: dict[str, str]) -> Iterator[None]:
-    """Keep the reason for which a field of the form is refused."""
-    try:
-        yield
-    except ConfigError as error:
-        wrong[name] = str(error).removesuffix(" with --out")
 
 
 def _write_picture_url(bench: Mapping[str, str], hide: str) -> str:

@@ -1,13 +1,14 @@
 """The rubric editor: a form for the numbers next to the text; an invalid rubric is not saved."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import urlencode
 
 from starlette.responses import RedirectResponse, Response
 
 from pipeline.desk.form_input import read_path
+from pipeline.desk.grades.grading_form import last_run
 from pipeline.desk.instructor.rubric_draft import RubricDraft, make_draft, read_draft
 from pipeline.desk.instructor.rubric_list import (
     free_name,
@@ -19,6 +20,7 @@ from pipeline.desk.instructor.rubric_list import (
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.users import name_place
 from pipeline.errors import ConfigError
+from pipeline.grading.intake.repairs import Run
 from pipeline.grading.rubric_file import rubric_source
 from pipeline.grading.rubric_text import rubric_text
 from pipeline.grading.words import WORDS, points_text
@@ -38,7 +40,8 @@ class RubricPage:
     seen : version of the file on which the typed text is based.
     now : current text of the file, if somebody has changed it since.
     classes : number and name of each open class.
-    graded : after saving: number, name and options of each class that the rubric graded.
+    graded : after saving: number and name of each class that the rubric graded, and what was
+        graded last in it.
     """
 
     file: Path
@@ -47,7 +50,7 @@ class RubricPage:
     now: str | None
     saved: bool
     classes: Sequence[tuple[int, str]]
-    graded: Sequence[tuple[int, str, Mapping[str, str]]]
+    graded: Sequence[tuple[int, str, Run | None]]
 
     @property
     def is_new(self) -> bool:
@@ -134,16 +137,20 @@ def show_editor(
     return ask.page("rubric", status=status, title=path.name, page=page, **functions)
 
 
-def _classes_of(ask: PageRequest, path: Path) -> list[tuple[int, str, dict[str, str]]]:
-    """Return the open classes graded by a rubric file, with the options of their last regrading."""
+def _classes_of(ask: PageRequest, path: Path) -> list[tuple[int, str, Run | None]]:
+    """Return the open classes graded by a rubric file, with what was graded last in each."""
     found = []
     for n, place in enumerate(ask.user.gradebooks):
         try:
-            assignment = ask.desk.gradebooks.gradebook(place).assignment
+            book = ask.desk.gradebooks.gradebook(place)
+            assignment, anonymous = book.assignment, book.rubric.anonymous
         except ConfigError:  # nothing is graded there yet, or the gradebook is gone
             continue
         if assignment == path.stem and isinstance(place, Path):
-            found.append((n, name_place(place), ask.desk.gradebooks.asked.get(place, {})))
+            run = last_run(ask.user, place)
+            if run and anonymous:  # the paths may contain names
+                run = replace(run, paths=())
+            found.append((n, name_place(place), run))
     return found
 
 

@@ -137,7 +137,7 @@ def grade_class(
     late_table = read_late_table(options.lateness) if options.lateness else {}
     hidden = rubric.anonymous or options.anonymous
     place = options.gradebook or out
-    _refuse_submission(named_folder(out))
+    refuse_submission(named_folder(out))
     if options.gradebook is None:
         _refuse_another_class(out, assignment=rubric_file.stem)
     # The file name of the rubric identifies the assignment, because the title may change later.
@@ -197,7 +197,7 @@ def grade_class(
     )
 
 
-def _refuse_submission(out: Path) -> None:
+def refuse_submission(out: Path) -> None:
     """Raise a ConfigError if `out` is inside a submission, which the output would change."""
     for folder in (out.resolve(), *out.resolve().parents):
         if (folder / NAME).is_file():

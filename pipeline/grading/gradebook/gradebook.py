@@ -300,6 +300,12 @@ class Gradebook:
     # ---------------------------------------------------------------- current class list
 
     @property
+    def is_graded(self) -> bool:
+        """Whether a batch is complete, so that there is a class list."""
+        with self._database.reading() as connection:
+            return self._newest(connection) is not None
+
+    @property
     def assignment(self) -> str:
         """The assignment of the class list.
 

@@ -14,6 +14,7 @@ from pipeline.grading.intake.unpack import (
     DEEPEST,
     STRANGE_ARCHIVES,
     is_debris,
+    list_members,
     member_names,
     names_in_pieces,
     unpack,
@@ -92,24 +93,54 @@ def find_hand_ins(
     for number, path in enumerate(dict.fromkeys(path.resolve() for path in paths)):
         here = _find_at(path, scratch=scratch / f"class-{number}", walk=walk)
         if not here:
-            raise ConfigError(
-                f"{path}: nothing to grade: it has no folder or zip file with a {NAME}"
-            )
+            raise _nothing_to_grade(path)
         found += here
     return tuple(sorted(_with_ids(found, known=known), key=lambda hand_in: hand_in.id))
 
 
-def _find_at(path: Path, *, scratch: Path, walk: _Walk) -> list[HandIn]:
+def check_hand_ins(path: Path, *, skip: Iterable[Path] = ()) -> None:
+    """Check that a folder or an archive has something to grade, without unpacking it.
+
+    Raises
+    ------
+    ConfigError : the path does not exist, is a broken archive, or contains nothing to grade.
+    """
+    path = _folder_or_archive(path.resolve())
+    if path.is_dir():
+        skipped = {one.resolve() for one in skip}
+        found = bool(_in_folder(path, walk=_Walk(skip=skipped, say=silent)))
+    else:
+        try:
+            names = list_members(path, limits=CLASS)
+        except SubmissionError as error:
+            raise ConfigError(str(error)) from None
+        found = any(name.name == NAME or name.suffix.lower() == ".zip" for name in names)
+        found = found or _holds_a_class(path)
+    if not found:
+        raise _nothing_to_grade(path)
+
+
+def _nothing_to_grade(path: Path) -> ConfigError:
+    return ConfigError(f"{path}: nothing to grade: it has no folder or zip file with a {NAME}")
+
+
+def _folder_or_archive(path: Path) -> Path:
+    """Return the folder or zip file that a path means, or raise a ConfigError."""
     if path.name == NAME:
         path = path.parent
-    if path.is_dir():
-        return _in_folder(path, walk=walk)
-    if not path.is_file():
+    if not path.is_dir() and not path.is_file():
         raise ConfigError(f"{path}: there is no such file or folder")
-    if path.suffix.lower() != ".zip":
+    if not path.is_dir() and path.suffix.lower() != ".zip":
         raise ConfigError(
             f"{path}: neither a folder nor a zip file; give the folder with the {NAME}"
         )
+    return path
+
+
+def _find_at(path: Path, *, scratch: Path, walk: _Walk) -> list[HandIn]:
+    path = _folder_or_archive(path)
+    if path.is_dir():
+        return _in_folder(path, walk=walk)
     if not _holds_a_class(path):
         return [_archive(path)]
     folder = scratch / path.stem
@@ -340,8 +371,8 @@ def _with_ids(found: Sequence[HandIn], *, known: Iterable[str] = ()) -> list[Han
     known : ids of the current class. A hand-in that is in the class under its name with the prefix
         keeps the prefix.
     """
-    names = [_fit(one.id) for one in found]
-    longer = [_fit(f"{one.parent}-{one.id}") for one in found]
+    names = [fit_name(one.id) for one in found]
+    longer = [fit_name(f"{one.parent}-{one.id}") for one in found]
     often, before = Counter(name.casefold() for name in names), set(known)
     names = [
         long if often[name.casefold()] > 1 or (long in before and name not in before) else name
@@ -359,7 +390,7 @@ def _with_ids(found: Sequence[HandIn], *, known: Iterable[str] = ()) -> list[Han
     return hand_ins
 
 
-def _fit(name: str) -> str:
+def fit_name(name: str) -> str:
     """Return a name that every system accepts for a folder, and that is safe to print."""
     text = unicodedata.normalize("NFC", name)
     text = _NOT_IN_NAMES.sub("_", text.encode("utf-8", "replace").decode())

@@ -110,28 +110,40 @@ def unpack(archive: Path, into: Path, *, limits: UnpackLimits) -> dict[PurePosix
         with _opened(archive, limits=limits) as opened:
             return _extract(opened, into, budget=_Budget(limits=limits))
     except _TROUBLE as error:
-        _let_through(error)
-        again = _AGAIN if isinstance(error, zipfile.BadZipFile) else ""
-        raise SubmissionError(f"{shown}: {_why(error)}{again}") from None
+        raise _as_submission_error(error, shown=shown) from None
 
 
 def member_names(archive: Path, *, limits: UnpackLimits = HAND_IN) -> list[PurePosixPath]:
     """Return the names of the files that may be unpacked; empty if the file is not an archive.
 
-    Files that macOS or Windows created are left out.
-
     Raises
     ------
     OSError : this computer cannot read the archive now.
     """
-    if not archive.is_file():  # reading a pipe would block
+    try:
+        return list_members(archive, limits=limits)
+    except SubmissionError:
         return []
+
+
+def list_members(archive: Path, *, limits: UnpackLimits) -> list[PurePosixPath]:
+    """Return the names of the files that may be unpacked; nothing is unpacked.
+
+    Files that macOS or Windows created are left out.
+
+    Raises
+    ------
+    SubmissionError : the file is not a zip archive, or it is broken or too large.
+    OSError : this computer cannot read the archive now.
+    """
+    shown = quote(archive.name)
+    if not archive.is_file():  # reading a pipe would block
+        raise SubmissionError(f"{shown}: is not a file")
     try:
         with _opened(archive, limits=limits) as opened:
             infos = [info for info in opened.infolist() if not info.is_dir()]
     except _TROUBLE as error:
-        _let_through(error)
-        return []
+        raise _as_submission_error(error, shown=shown) from None
     paths = []
     for info in infos:
         with suppress(_Refused):
@@ -179,6 +191,13 @@ def _let_through(error: Exception) -> None:
     """Re-raise an error that was caused by this computer and not by the archive."""
     if isinstance(error, OSError) and not is_name_fault(error):
         raise error
+
+
+def _as_submission_error(error: Exception, *, shown: str) -> SubmissionError:
+    """Return the error of an archive in one line; an error of this computer is raised instead."""
+    _let_through(error)
+    again = _AGAIN if isinstance(error, zipfile.BadZipFile) else ""
+    return SubmissionError(f"{shown}: {_why(error)}{again}")
 
 
 def _why(error: Exception) -> str:
