@@ -46,7 +46,7 @@ HOMES = {
     "typer": ("cli",),
     "rich": ("cli", "bench"),
     "serial": ("bench",),
-    "tomlkit": ("submission", "ingest", "bench", "desk.student"),
+    "tomlkit": ("submission", "ingest", "bench", "desk"),
     "starlette": ("web", "bench", "desk"),
     "uvicorn": ("web",),
     "control": ("plant", "notebook"),

@@ -28,7 +28,7 @@ from pipeline.desk.grades import (
     team_page,
 )
 from pipeline.desk.home import enter, open_place, show_folders, show_home
-from pipeline.desk.instructor import exercise_pages, rubric_editor, rubric_preview_page
+from pipeline.desk.instructor import exercise_pages, rubric_pages
 from pipeline.desk.login import PAGE_HEADERS, JupyterLogin, ProxyLogin, SecretLogin, limit_bodies
 from pipeline.desk.page_request import Desk, PageRequest, plain_error, prepare_pages
 from pipeline.desk.scratch import clear_scratch
@@ -152,11 +152,11 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/exercises/made", "GET", exercise_pages.show_made),
     ("/exercises/stop", "POST", exercise_pages.stop),
     ("/effects/", "GET", exercise_pages.show_catalogue),
-    ("/rubric/", "GET", rubric_editor.show),
-    ("/rubric/check", "POST", rubric_editor.check),
-    ("/rubric/save", "POST", rubric_editor.save),
-    ("/rubric/preview", "POST", rubric_preview_page.preview),
-    ("/rubric/preview.svg", "GET", rubric_preview_page.draw_preview),
+    ("/rubric/", "GET", rubric_pages.show),
+    ("/rubric/check", "POST", rubric_pages.check),
+    ("/rubric/save", "POST", rubric_pages.save),
+    ("/rubric/preview", "POST", rubric_pages.preview),
+    ("/rubric/preview.svg", "GET", rubric_pages.draw_preview),
     ("/solution/{n:nth}/", "GET", exercise_pages.show_solution),
     ("/solution/{n:nth}/make", "POST", _start("make_solution", "The solution")),
     ("/solution/{n:nth}/{name:path}", "GET", _serve("solution")),

@@ -26,6 +26,7 @@ from pipeline.desk.parts import leave_out_parts
 from pipeline.desk.users import Place, User, name_place
 from pipeline.desk.visibility import Visibility
 from pipeline.errors import ConfigError
+from pipeline.grading.words import points_text
 from pipeline.processes import Failed
 from pipeline.resources import TEMPLATES
 from pipeline.words.text import breakable
@@ -301,7 +302,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"called": name_place, "breakable": breakable}
+    environment.filters |= {"called": name_place, "breakable": breakable, "points": points_text}
     # This random number in the addresses of style sheets and scripts keeps browsers from using old
     # copies.
     environment.globals["fresh"] = secrets.token_hex(4)

@@ -91,25 +91,43 @@ def edit_submission(
         if version:
             require_version(text, version, name=NAME)
         where = f"{folder.resolve().name}/{NAME}"
-        newline = "\r\n" if "\r\n" in text else "\n"
         try:
-            document = tomlkit.parse(text.replace("\r\n", "\n"))
-            change(document)
-            new = re.sub(r"(?<!\n)\n{3,}(?=\[\[experiments\]\])", "\n\n", tomlkit.dumps(document))
-            new = new.rstrip() + "\n"
-        except (TOMLKitError, RecursionError) as error:
-            raise SubmissionError(f"{where}: cannot be edited by cartlab ({error})") from None
+            new = edit_text(text, change, where=where, error=SubmissionError)
         except ValueError:  # an integer of thousands of digits
             parse_submission(text, folder=folder, where=where)  # raises if the file was invalid
             raise SubmissionError(f"{where}: a number has too many digits") from None
         except (TypeError, AttributeError, LookupError):
             parse_submission(text, folder=folder, where=where)  # raises if the file lacks a table
             raise
+        new = re.sub(r"(?<!\n)\n{3,}(?=\[\[experiments\]\])", "\n\n", new).rstrip() + "\n"
         if len(new.encode()) > MAX_TOML_BYTES:
             raise SubmissionError(f"{where}: would exceed {MAX_TOML_BYTES:,} bytes")
         submission = parse_submission(new, folder=folder, where=where)
+        newline = "\r\n" if "\r\n" in text else "\n"
         write_file(folder / NAME, new.replace("\n", newline))
         return submission
+
+
+def edit_text(
+    text: str,
+    change: Callable[[tomlkit.TOMLDocument], None],
+    *,
+    where: str,
+    error: type[PipelineError],
+) -> str:
+    """Return a TOML text, with plain line ends, after a change of its document.
+
+    Parameters
+    ----------
+    where : name of the file in messages.
+    error : class of error to raise if the text cannot be changed in this way.
+    """
+    try:
+        document = tomlkit.parse(text.replace("\r\n", "\n"))
+        change(document)
+        return tomlkit.dumps(document)
+    except (TOMLKitError, RecursionError) as wrong:
+        raise error(f"{where}: cannot be edited by cartlab ({wrong})") from None
 
 
 def append_experiment(

@@ -9,15 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.desk.student.folder_tasks import read_document
-from pipeline.desk.student.form import (
-    Fault,
-    Field,
-    fill_experiment,
-    fill_form,
-    find_changes,
-    mark_errors,
-    write_fields,
-)
+from pipeline.desk.student.form import Fault, fill_experiment, fill_form, mark_errors, write_fields
+from pipeline.desk.toml_form import Field, find_changes
 from pipeline.errors import SubmissionError
 from pipeline.resources import EXAMPLES
 from pipeline.submission import new_submission

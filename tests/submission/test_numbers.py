@@ -12,7 +12,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.desk.student.folder_tasks import read_document
-from pipeline.desk.student.form import Field, fill_experiment, fill_form, write_fields
+from pipeline.desk.student.form import fill_experiment, fill_form, write_fields
+from pipeline.desk.toml_form import Field
 from pipeline.desk.users import read_users
 from pipeline.errors import PipelineError, SubmissionError
 from pipeline.experiments.plan import load_plan, plan_path, save_plan

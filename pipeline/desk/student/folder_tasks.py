@@ -17,13 +17,13 @@ from pipeline.desk.last_report import NOTES, read_findings, read_notes
 from pipeline.desk.student import check_state, files
 from pipeline.desk.student.form import (
     Fault,
-    Field,
     clear_marks,
     remove_experiment,
     sign_fields,
     write_fields,
 )
 from pipeline.desk.student.handin import list_held, list_missing
+from pipeline.desk.toml_form import Field
 from pipeline.errors import SubmissionError
 from pipeline.identify.springs import find_springs
 from pipeline.ingest.fill import UNSURE, data_files, experiment_doubts, system_doubts

@@ -1,25 +1,26 @@
-"""The form of `submission.toml`: show its keys as fields, and write typed values back.
+"""The form of `submission.toml`: its groups of fields, its authors, and the marks of doubts."""
 
-Typed values are written into the file unchanged, with all their digits. The usual check of a
-submission then reports mistakes, so nothing is checked twice. The model of a submission also
-supplies the help and the type of each field.
-"""
-
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
 import tomlkit
 from tomlkit.items import AoT, Comment, Null
 
+from pipeline.desk.toml_form import (
+    Field,
+    describe_field,
+    find_value,
+    read_value,
+    set_item,
+    write_field,
+)
 from pipeline.errors import SubmissionError
 from pipeline.ingest.fill import UNSURE
 from pipeline.names import parameter_names, read_name
 from pipeline.setup import Units
 from pipeline.submission import Submission
-from pipeline.submission.edit import comment_text, toml_item
+from pipeline.submission.edit import comment_text
 from pipeline.submission.load import InvalidSubmission, list_experiments, spring_names
 from pipeline.submission.models import MOST_CARTS
 from pipeline.words.text import symbol_text
@@ -80,46 +81,6 @@ class Fault:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Answer:
-    """A possible answer to a question about a field: the text of its button, and the new value."""
-
-    label: str
-    value: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Field:
-    """One key of `submission.toml` as a field of the form.
-
-    Attributes
-    ----------
-    path : path of the key in the file.
-    kind : text, number, numbers, rows (of numbers, one per line), flags, authors, columns, or words
-        (a text of several lines).
-    choices : the possible values; "" means that the key is left out.
-    asked : question about a value that is doubtful but possible.
-    symbol : symbol of the parameter, if the value is a parameter.
-    """
-
-    path: str
-    label: str
-    help: str = ""
-    kind: str = "text"
-    choices: tuple[str, ...] = ()
-    names: tuple[str, ...] = ()
-    value: str = ""
-    wrong: str = ""
-    asked: str = ""
-    answers: tuple[Answer, ...] = ()
-    symbol: str = ""
-
-    @property
-    def on(self) -> list[bool]:
-        """The flags as booleans."""
-        return [word == "true" for word in self.value.split()]
-
-
-@dataclass(frozen=True, kw_only=True)
 class Group:
     """Fields that belong together.
 
@@ -144,14 +105,16 @@ class Group:
 def fill_form(document: Mapping[str, Any]) -> list[Group]:
     """Return the form of a submission, filled in from its file."""
     *first, last = [
-        Group(key=key, title=title, fields=tuple(map(_describe_field, paths)))
+        Group(
+            key=key, title=title, fields=tuple(describe_field(path, Submission) for path in paths)
+        )
         for key, title, paths in _GROUPS
     ]
     carts = count_carts(document)
-    rigid = carts == 1 and _find(document, "system.springs") == [False, False]
+    rigid = carts == 1 and find_value(document, "system.springs") == [False, False]
     units = Units(
-        position=str(_find(document, "system.position.unit") or "count"),
-        input=str(_find(document, "system.input.unit") or "V"),
+        position=str(find_value(document, "system.position.unit") or "count"),
+        input=str(find_value(document, "system.input.unit") or "V"),
     )
     claims = tuple(
         Field(
@@ -175,13 +138,13 @@ def fill_experiment(document: Mapping[str, Any], index: int) -> tuple[Field, ...
     table.
     """
     table = f"experiments.{index}"
-    kind = _find(document, f"{table}.kind")
-    chosen = _find(document, f"{table}.controller.type")
+    kind = find_value(document, f"{table}.kind")
+    chosen = find_value(document, f"{table}.controller.type")
     of_type = [f"controller.{key}" for key in _OF_CONTROLLER.get(str(chosen), ())]
     used = {*_OF_EXPERIMENT, *_OF_LOOP[:3], *of_type} - ({"frequency"} if kind != "sine" else set())
     first, rest = _OF_EXPERIMENT[:2], _OF_EXPERIMENT[2:]
     keys = (*first, *_OF_LOOP, *rest) if kind == "closed_loop" else _OF_EXPERIMENT
-    fields = _fill([_describe_field(f"{table}.{key}") for key in keys], document)
+    fields = _fill([describe_field(f"{table}.{key}", Submission) for key in keys], document)
     return tuple(f for f, key in zip(fields, keys, strict=True) if key in used or f.value)
 
 
@@ -193,44 +156,16 @@ def sign_fields(document: Mapping[str, Any], signs: Mapping[str, int]) -> list[F
     signs : sign of the input, by experiment.
     """
     return [
-        replace(_describe_field(path), value=f"{signs[table['id']]:d}")
+        replace(describe_field(path, Submission), value=f"{signs[table['id']]:d}")
         for index, table in enumerate(list_experiments(document))
         for path in [f"experiments.{index}.input.sign"]
-        if table.get("id") in signs and _find(document, path) is None
+        if table.get("id") in signs and find_value(document, path) is None
     ]
 
 
 def is_of_loop(field: Field) -> bool:
     """Return whether a field of an experiment describes the controller that ran."""
     return field.path.split(".", 2)[2] in _OF_LOOP
-
-
-def find_changes(fields: Iterable[Field], form: Mapping[str, Any], values: Any) -> list[Field]:
-    """Return the fields that were changed or answered, with their new values.
-
-    Parameters
-    ----------
-    form : typed text by path; a field without an entry was not shown.
-    values : function that returns all values of a form field. For a field of flags, these are the
-        numbers of the flags that are on. For `answer`, they are texts "path=value", one for each
-        answered question.
-    """
-    changed = []
-    answered = dict(one.partition("=")[::2] for one in values("answer"))
-    for field in fields:
-        if field.path in answered:
-            changed.append(replace(field, value=answered[field.path]))
-            continue
-        if field.kind == "flags":
-            on = values(field.path)
-            text = " ".join("true" if str(i) in on else "false" for i in range(len(field.names)))
-            shown = f"{field.path}.shown" in form
-        else:
-            text = str(form.get(field.path, "")).replace("\r\n", "\n").strip()
-            shown = field.path in form
-        if shown and text != field.value.strip():
-            changed.append(replace(field, value=text))
-    return changed
 
 
 def mark_errors(
@@ -251,130 +186,19 @@ def mark_errors(
     return tuple(shown), left
 
 
-# ------------------------------------------------------------------- a key as a field
-
-
-@cache
-def _schema() -> dict[str, Any]:
-    return Submission.model_json_schema()
-
-
-def _variants(node: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the JSON Schemas of the types that a value may have, without null."""
-    for key in ("anyOf", "oneOf"):
-        if key in node:
-            return [found for one in node[key] for found in _variants(one)]
-    if "$ref" in node:
-        return _variants(_schema()["$defs"][node["$ref"].rpartition("/")[2]])
-    return [] if node.get("type") == "null" else [dict(node)]
-
-
-def _describe_field(path: str) -> Field:
-    """Return the empty field of a key, as described by the submission's model."""
-    tables, keys, required = [_schema()], [], True
-    for part in path.split("."):
-        tables = [variant for key in keys for variant in _variants(key)] or tables
-        if part.isdecimal():
-            keys, required = [table["items"] for table in tables], True
-        else:
-            holders = [table for table in tables if part in table["properties"]]
-            keys = [table["properties"][part] for table in holders]
-            required &= all(part in table.get("required", ()) for table in holders)
-    values = [variant for key in keys for variant in _variants(key)]
-    return Field(
-        path=path,
-        label=keys[0]["title"],
-        help=keys[0].get("description", ""),
-        kind=_find_kind(values[0]),
-        choices=_list_choices(values, first=[] if required else ["", keys[0].get("default")]),
-    )
-
-
-def _find_kind(value: Mapping[str, Any]) -> str:
-    """Return the kind of a field; see `Field`."""
-    kind = value["type"]
-    if kind == "array":
-        inner = _variants(value.get("items") or value["prefixItems"][0])[0]["type"]
-        return {"object": "authors", "array": "rows", "boolean": "flags"}.get(inner, "numbers")
-    if kind == "string":
-        return "words" if value.get("maxLength", 0) > 200 else "text"
-    return {"object": "columns"}.get(kind, "number")
-
-
-def _list_choices(values: Sequence[Mapping[str, Any]], *, first: Sequence[Any]) -> tuple[str, ...]:
-    """Return the possible values of a field, or () if any text can be typed."""
-    every = [
-        choice
-        for value in values
-        for choice in (value.get("enum") or ([value["const"]] if "const" in value else []))
-    ]
-    if values[0]["type"] == "integer" and "maximum" in values[0]:
-        every = list(range(values[0]["minimum"], values[0]["maximum"] + 1))
-    known = [one for one in first if one == "" or one in every] if every else []
-    return tuple(map(str, dict.fromkeys([*known, *every])))
-
-
 # --------------------------------------------------------------- from the file to the form
 
 
 def count_carts(document: Mapping[str, Any]) -> int:
     """Return the number of carts in a file; 1 if the file states no valid number."""
-    carts = _find(document, "system.carts")
+    carts = find_value(document, "system.carts")
     return carts if isinstance(carts, int) and 1 <= carts <= MOST_CARTS else 1
 
 
 def _fill(fields: Iterable[Field], document: Mapping[str, Any]) -> tuple[Field, ...]:
     springs = tuple(spring_names(count_carts(document)))
-    return tuple(
-        replace(
-            field,
-            names=springs if field.kind == "flags" else (),
-            value=read_value(document, field),
-        )
-        for field in fields
-    )
-
-
-def _find(document: Any, path: str) -> Any:
-    here = document
-    for part in path.split("."):
-        try:
-            here = here[int(part)] if isinstance(here, list) else here[part]
-        except (KeyError, IndexError, TypeError, ValueError):
-            return None
-    return here
-
-
-def read_value(document: Mapping[str, Any], field: Field) -> str:
-    """Return the value of a field in a document, as a person would type it."""
-    value = _find(document, field.path)
-    if field.kind == "flags":
-        every = [True] * (count_carts(document) + 1)
-        stated = value if isinstance(value, list) and len(value) == len(every) else every
-        return " ".join("true" if flag else "false" for flag in stated)
-    if value is None:
-        return ""
-    if field.kind == "authors" and isinstance(value, list):
-        people = [
-            [_write_value(person.get(key, "")) for key in ("id", "name")]
-            for person in value
-            if isinstance(person, dict)
-        ]
-        return "\n".join(", ".join(filter(None, person)) for person in people)
-    if field.kind == "columns" and isinstance(value, dict):
-        return "\n".join(f"{role} = {_write_value(column)}" for role, column in value.items())
-    if field.kind == "rows" and isinstance(value, list):
-        return "\n".join(map(_write_value, value))
-    return _write_value(value)
-
-
-def _write_value(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(_write_value, value))
-    try:
-        return str(value)
-    except ValueError:  # a number with thousands of digits, which can only have been typed in hex
-        return hex(value)
+    named = (replace(f, names=springs if f.kind == "flags" else ()) for f in fields)
+    return tuple(replace(field, value=read_value(document, field)) for field in named)
 
 
 # --------------------------------------------------------------- from the form to the file
@@ -387,12 +211,11 @@ def write_fields(document: tomlkit.TOMLDocument, changed: Iterable[Field]) -> No
             _set_authors(document, field.value)
         else:
             # These two keys stay without a value, because they have comments in a new file.
-            empty = not field.value and field.path not in ("title", "section")
-            _set(document, field.path.split("."), None if empty else _make_item(field))
+            write_field(document, field, keep_empty=field.path in ("title", "section"))
             _settle(document, field.path)
         # After a change of the number of carts, all springs count as present again.
         if field.path == "system.carts":
-            _set(document, ["system", "springs"], None)
+            set_item(document, ["system", "springs"], None)
 
 
 def _settle(document: tomlkit.TOMLDocument, path: str) -> None:
@@ -431,71 +254,6 @@ def remove_experiment(document: tomlkit.TOMLDocument, index: int) -> None:
         del tables[index]
 
 
-def _make_item(field: Field) -> Any:
-    """Return a typed value as a TOML item."""
-    match field.kind:
-        case "number":
-            return _make_number(field.value)
-        case "flags":
-            return toml_item(field.on)
-        case "numbers":
-            return _make_numbers(field.value)
-        case "columns":
-            pairs = (line.partition("=")[::2] for line in field.value.splitlines())
-            return toml_item(
-                {
-                    role.strip(): int(column) if column.strip().isdecimal() else column.strip()
-                    for role, column in pairs
-                }
-            )
-        case "rows":
-            rows = tomlkit.array()
-            for line in field.value.splitlines():
-                rows.append(_make_numbers(line))
-            return rows.multiline(True)
-    return tomlkit.item(field.value)
-
-
-def _make_number(text: str) -> Any:
-    """Return a number with its digits as typed.
-
-    Other text stays text, which the check then refuses.
-    """
-    if re.fullmatch(r"[-+]?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?", text):
-        return tomlkit.parse(f"x = {text}\n")["x"]
-    return tomlkit.item(text)
-
-
-def _make_numbers(text: str) -> Any:
-    array = tomlkit.array()
-    for word in re.split(r"[,;\s]+", text.strip("[] ")):
-        if word:
-            array.append(_make_number(word))
-    return array
-
-
-def _set(document: Any, parts: Sequence[str], item: Any) -> None:
-    """Set the item at a path; None removes the key, and tables that become empty."""
-    part, *rest = parts
-    if isinstance(document, list):
-        return _set(document[int(part)], rest, item)
-    if not rest:
-        if item is not None:
-            document[part] = item
-        elif part in document:
-            del document[part]
-        return
-    if part not in document:
-        if item is None:
-            return
-        above = bool(rest[1:])  # a table [reported.final] needs no heading [reported] above it
-        in_one_line = part in ("input", "position", "controller", "columns")
-        document[part] = tomlkit.inline_table() if in_one_line else tomlkit.table(above)
-    _set(document[part], rest, item)
-    if part not in ("system", "experiments") and not document[part]:
-        del document[part]
-
-
 def _set_authors(document: tomlkit.TOMLDocument, text: str) -> None:
     """Write the authors, one per line of text; an existing table keeps what was not changed."""
     lines = [line.partition(",")[::2] for line in text.splitlines() if line.strip()]
@@ -516,7 +274,7 @@ def _set_authors(document: tomlkit.TOMLDocument, text: str) -> None:
             continue
         for key, value in zip(("id", "name"), person, strict=True):
             if str(tables[i].get(key, "")) != value:
-                _set(tables[i], [key], tomlkit.item(value) if value else None)
+                set_item(tables[i], [key], tomlkit.item(value) if value else None)
     while len(tables) > len(people):
         del tables[len(tables) - 1]
 

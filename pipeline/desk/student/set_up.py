@@ -4,7 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from pipeline.desk.student.form import Answer, Field, Group
+from pipeline.desk.student.form import Group
+from pipeline.desk.toml_form import Answer, Field
 from pipeline.ingest.columns import is_known, position_units
 from pipeline.ingest.fill import unit_doubt
 from pipeline.words.numbers import count, listing

@@ -18,14 +18,7 @@ from pipeline.desk.form_input import read_whole_number
 from pipeline.desk.page_request import Message, PageRequest
 from pipeline.desk.scratch import scratch_folder
 from pipeline.desk.student.files import take_uploads
-from pipeline.desk.student.form import (
-    Fault,
-    Field,
-    fill_experiment,
-    fill_form,
-    find_changes,
-    read_value,
-)
+from pipeline.desk.student.form import Fault, fill_experiment, fill_form
 from pipeline.desk.student.recording_rows import (
     FileGroup,
     describe_all,
@@ -33,6 +26,7 @@ from pipeline.desk.student.recording_rows import (
     group_rows,
 )
 from pipeline.desk.student.submission_view import StalePage, SubmissionView, read_room, show_stale
+from pipeline.desk.toml_form import Field, find_changes, read_value
 from pipeline.processes import Failed
 from pipeline.submission.load import NAME, file_problem, list_experiments, posix
 from pipeline.words.numbers import count, group_messages

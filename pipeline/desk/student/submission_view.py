@@ -8,10 +8,11 @@ from starlette.responses import Response
 
 from pipeline.desk import last_report
 from pipeline.desk.page_request import PageRequest
-from pipeline.desk.student.form import Fault, Field, Group, fill_form, mark_errors
+from pipeline.desk.student.form import Fault, Group, fill_form, mark_errors
 from pipeline.desk.student.recording_rows import RecordingRow, list_rows
 from pipeline.desk.student.set_up import NO_QUESTIONS, ask_setup_questions, summarise
 from pipeline.desk.student.steps import Step, StepFacts, find_steps, next_step
+from pipeline.desk.toml_form import Field
 from pipeline.processes import Failed
 from pipeline.submission.edit import text_digest
 from pipeline.submission.load import NAME

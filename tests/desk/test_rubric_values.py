@@ -3,21 +3,15 @@
 import re
 import tomllib
 from decimal import Decimal
-from pathlib import Path
 from typing import Any, cast
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ConfigError
-from pipeline.grading.rubric_file import load_rubric, parse_rubric
-from pipeline.grading.rubric_form import (
-    WrongFields,
-    changed_fields,
-    rubric_form,
-    with_values,
-)
+from pipeline.desk.instructor.rubric_form import make_draft, rubric_form, with_values
+from pipeline.desk.toml_form import find_changes
+from pipeline.grading.rubric_file import parse_rubric
 from pipeline.resources import RUBRICS
 
 SHIPPED = {path.stem: path.read_text(encoding="utf-8") for path in sorted(RUBRICS.glob("*.toml"))}
@@ -30,9 +24,8 @@ HEAD, CRITERIA = ONE[: ONE.index("[late]")], ONE[ONE.index("[[criteria]]") :]  #
 def typed_into(text: str, **typed: str) -> str:
     """Return the text of a rubric after a form with these values has been saved."""
     form = rubric_form(parse_rubric(text, where=""))
-    return with_values(
-        text, changed_fields(form, {k.replace("__", "."): v for k, v in typed.items()})
-    )
+    named = {name.replace("__", "."): value for name, value in typed.items()}
+    return with_values(text, find_changes(form.fields(), named))
 
 
 def _comments(text: str) -> list[str]:
@@ -55,16 +48,19 @@ def test_a_form_keeps_comments_and_order(data):
         for field in fields
     }
 
-    changed = changed_fields(form, typed)
+    changed = find_changes(form.fields(), typed)
     new = with_values(text, changed)
 
     document, before = tomllib.loads(new), tomllib.loads(text)
-    for key, value in changed.items():
+    for field in changed:
+        key = [int(part) if part.isdecimal() else part for part in field.path.split(".")]
         here: Any = document
         for part in key[:-1]:
             here = here[part]
         found = here.pop(key[-1])
-        assert (found if isinstance(value, str) else Decimal(str(found))) == value
+        scale = 100 if field.kind == "share" else 1
+        shown = found if field.choices else Decimal(str(found)) * scale
+        assert shown == (field.value if field.choices else Decimal(field.value))
         was: Any = before
         for part in key[:-1]:
             was = was.get(part, {}) if isinstance(was, dict) else was[part]
@@ -86,13 +82,13 @@ def test_an_unchanged_form_changes_no_byte():
     for text in SHIPPED.values():
         form = rubric_form(parse_rubric(text, where=""))
         shown = {field.name: field.value for field in form.fields()}
-        assert with_values(text, changed_fields(form, shown)) == text
+        assert with_values(text, find_changes(form.fields(), shown)) == text
         zeros = {
             field.name: f"{field.value}0" if "." in field.value else f"{field.value}.0"
             for field in form.fields()
             if not field.choices
         }
-        assert with_values(text, changed_fields(form, zeros)) == text
+        assert with_values(text, find_changes(form.fields(), zeros)) == text
 
 
 def test_one_changed_number_changes_one_line():
@@ -115,11 +111,27 @@ def test_a_missing_table_is_added_before_the_criteria():
     assert parse_rubric(new, where="").late.percent_per_day == 12.5
 
 
-def test_an_inline_table_is_not_changed():
-    """An inline table is not changed by the form; the error says so."""
-    inline = f"late = {{ percent_per_day = 10 }}\n{HEAD}{CRITERIA}"
-    with pytest.raises(ConfigError, match=r"late\.percent_per_day: "):
-        typed_into(inline, late__percent_per_day="50")
+@pytest.mark.parametrize(
+    ("late", "changed"),
+    [
+        (
+            "late = { percent_per_day = 10 }  # a day\n",
+            "late = { percent_per_day = 50 }  # a day\n",
+        ),
+        ("late.percent_per_day = 10\n", "late.percent_per_day = 50\n"),
+    ],
+)
+def test_a_table_without_a_heading_is_changed_in_its_place(late, changed):
+    """A value in a table that is written in one line, or with dots, is changed in its place."""
+    new = typed_into(f"{late}{HEAD}{CRITERIA}", late__percent_per_day="50")
+    assert new == f"{changed}{HEAD}{CRITERIA}"
+
+
+def test_a_new_key_stands_above_the_comments_of_the_next_table():
+    """A new key stands below the last key of its table, above a comment of the next heading."""
+    text = ONE.replace("[late]", "# an hour counts as a day\n[late]")
+    new = typed_into(text, flags__hz_for_rad_s="50")
+    assert new == text.replace("data_problem = 0.25\n", "data_problem = 0.25\nhz_for_rad_s = 0.5\n")
 
 
 def test_a_line_of_a_longer_text_is_not_changed():
@@ -143,12 +155,15 @@ def test_the_choice_of_what_students_see_is_saved():
     assert again == told.replace("'check'", '"report"')
 
 
-def test_a_wrong_value_is_named_with_its_field():
-    """All wrong values of a form are reported together, each with its field."""
-    form = rubric_form(load_rubric(Path("throne-1dof")))
+def test_a_wrong_value_is_marked_at_its_field():
+    """All wrong values of a form are marked, each at its field, and stay as typed."""
     typed = {"step": "much", "criteria.pieces.points": "", "late.grace_days": "nan",
              "students.see": "all"}  # fmt: skip
-    with pytest.raises(WrongFields) as wrong:
-        changed_fields(form, typed)
-    assert wrong.value.problems.keys() == typed.keys()
-    assert "'all'" in wrong.value.problems["students.see"]
+    draft = make_draft(ONE, typed)
+    assert draft.rubric is None
+    assert draft.edited == ONE
+    assert draft.form is not None
+    wrong = {field.name: field.value for field in draft.form.fields() if field.wrong}
+    assert wrong == typed
+    assert len(draft.mistakes) == len(typed)
+    assert make_draft(ONE, {"late.most_percent": "1e999999999"}).mistakes

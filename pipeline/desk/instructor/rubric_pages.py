@@ -1,0 +1,397 @@
+"""The rubric's pages: the list to start from, the editor, and the preview of a graded class.
+
+The editor has a form for the numbers next to the text. A rubric that is not valid is not saved.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+from starlette.exceptions import HTTPException
+from starlette.responses import RedirectResponse, Response
+
+from pipeline.desk.browse import find_root
+from pipeline.desk.form_input import read_path
+from pipeline.desk.grades.grading_form import last_run
+from pipeline.desk.instructor.rubric_form import RubricDraft, make_draft, read_draft
+from pipeline.desk.page_request import PageRequest
+from pipeline.desk.served_files import show_drawing
+from pipeline.desk.users import Place, User, name_place
+from pipeline.errors import ConfigError
+from pipeline.grading.intake.repairs import Run
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.rubric_file import parse_rubric, rubric_source
+from pipeline.grading.rubric_text import rubric_text
+from pipeline.output import write_file
+from pipeline.report.figures.grading import two_distributions_figure
+from pipeline.report.figures.style import drawing
+from pipeline.report.figures.svg import plain_svg, to_svg
+from pipeline.report.render.html import render_drawing
+from pipeline.resources import RUBRICS
+from pipeline.submission.edit import Stale, require_version, text_digest
+
+_NEW = "new"  # version in a form whose file does not exist yet
+
+
+# --------------------------------------------------------------------------- the list
+
+_MOST = 40  # files listed
+_LOOKED_AT = 2_000  # TOML files of a folder that are checked
+_MARK = "[[criteria]]"
+_START = 200_000  # a rubric contains _MARK within this many characters
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListedRubric:
+    """A rubric in the list.
+
+    Attributes
+    ----------
+    rubric : content of the file; None if it has mistakes.
+    """
+
+    name: str
+    path: Path
+    rubric: Rubric | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RubricList:
+    """What the list of rubrics shows: the shipped ones, and those in the instructor's folders."""
+
+    shipped: Sequence[ListedRubric]
+    own: Sequence[ListedRubric]
+
+
+def _shipped_names() -> list[str]:
+    return sorted(path.stem for path in RUBRICS.glob("*.toml"))
+
+
+def _shipped_rubrics() -> list[ListedRubric]:
+    found = (_list_rubric(RUBRICS / f"{name}.toml", name) for name in _shipped_names())
+    return [one for one in found if one is not None]
+
+
+def own_rubrics(user: User) -> list[ListedRubric]:
+    """Return the rubrics in a user's workshop.
+
+    The owner has no workshop. They get the rubrics near the open folders, and those in the folder
+    in which the desk was started.
+    """
+    found: dict[Path, ListedRubric] = {}
+    for root in _roots(user):
+        for path in _toml_files(root):
+            listed = _list_rubric(path, path.relative_to(root).as_posix())
+            if listed is not None and len(found) < _MOST:
+                found.setdefault(path.resolve(), listed)
+    return list(found.values())
+
+
+def _free_name(folder: Path) -> str:
+    """Return a file name that is still free in a folder: `rubric.toml`, `rubric-2.toml`, …"""
+    names = ("rubric.toml", *(f"rubric-{n}.toml" for n in range(2, 1000)))
+    return next((name for name in names if not (folder / name).exists()), "rubric.toml")
+
+
+def _roots(user: User) -> Sequence[Path]:
+    if user.workshop:
+        return (user.workshop,)
+    places = (place for place in (*user.gradebooks, *user.folders) if isinstance(place, Path))
+    return tuple(dict.fromkeys([find_root(), *(place.parent for place in places)]))
+
+
+def _toml_files(root: Path) -> Iterator[Path]:
+    """Yield the TOML files of a folder and of its direct subfolders."""
+    for pattern in ("*.toml", "*/*.toml"):
+        try:
+            found = sorted(root.glob(pattern))[:_LOOKED_AT]
+        except OSError:
+            continue
+        for path in found:
+            hidden = any(part.startswith(".") for part in path.relative_to(root).parts)
+            shipped = path.resolve().parent == RUBRICS.resolve()
+            if hidden or shipped or not path.is_file():
+                continue
+            if path.resolve().is_relative_to(root.resolve()):
+                yield path
+
+
+def _list_rubric(path: Path, name: str) -> ListedRubric | None:
+    """Return a file as an entry of the list; None if it is not a rubric."""
+    try:
+        text = rubric_source(path)
+    except ConfigError:
+        return None
+    if _MARK not in text[:_START]:
+        return None
+    try:
+        rubric = parse_rubric(text, where=path.name)
+    except ConfigError:
+        rubric = None
+    return ListedRubric(name=name, path=path, rubric=rubric)
+
+
+# --------------------------------------------------------------------------- the editor
+
+
+@dataclass(frozen=True, kw_only=True)
+class RubricPage:
+    """What the editor of a rubric shows.
+
+    Attributes
+    ----------
+    seen : version of the file on which the typed text is based.
+    now : current text of the file, if somebody has changed it since.
+    classes : number and name of each open class.
+    graded : after saving: number and name of each class that the rubric graded, and what was
+        graded last in it.
+    """
+
+    file: Path
+    typed: RubricDraft
+    seen: str
+    now: str | None
+    saved: bool
+    classes: Sequence[tuple[int, str]]
+    graded: Sequence[tuple[int, str, Run | None]]
+
+    @property
+    def is_new(self) -> bool:
+        """Whether the file does not exist yet."""
+        return self.seen == _NEW
+
+    @property
+    def in_words(self) -> str:
+        """The rubric in words; "" while it is not valid."""
+        return rubric_text(self.typed.rubric) if self.typed.rubric else ""
+
+
+def show(ask: PageRequest) -> Response:
+    """Show a rubric in the editor, or the list of rubrics if the request names no rubric.
+
+    A new file starts as a copy of a shipped rubric, or empty.
+    """
+    start = ask.text("start")
+    if not start and not ask.text("file"):
+        page = RubricList(shipped=_shipped_rubrics(), own=own_rubrics(ask.user))
+        return ask.page("rubrics", title="Rubrics", page=page)
+    path = _read_rubric_path(ask)
+    if path.exists():
+        text = rubric_source(path)
+        return _show_editor(ask, path, make_draft(text, {}), version=text_digest(text))
+    text = rubric_source(RUBRICS / f"{start}.toml") if start in _shipped_names() else ""
+    return _show_editor(ask, path, make_draft(text, {}), version=_NEW)
+
+
+def check(ask: PageRequest) -> Response:
+    """Show what is wrong with the typed rubric; nothing is saved."""
+    path = _read_rubric_path(ask)
+    return _show_editor(ask, path, read_draft(ask.form), version=ask.text("seen"))
+
+
+def save(ask: PageRequest) -> Response:
+    """Save a valid rubric, unless the file has changed since it was shown."""
+    path, typed, seen = _read_rubric_path(ask), read_draft(ask.form), ask.text("seen")
+    try:
+        if path.exists():
+            require_version(rubric_source(path), seen, name=path.name)
+        elif seen != _NEW:
+            raise Stale(path.name, "")
+    except Stale as error:
+        return _show_editor(ask, path, typed, version=seen, now=error.text, status=409)
+    if typed.rubric is None:
+        return _show_editor(ask, path, typed, version=seen, status=422)
+    write_file(path, typed.text)
+    query = urlencode({"file": path, "saved": 1})
+    return RedirectResponse(f"/rubric/?{query}", status_code=303)
+
+
+def _show_editor(
+    ask: PageRequest,
+    path: Path,
+    typed: RubricDraft,
+    *,
+    version: str,
+    now: str | None = None,
+    status: int = 200,
+) -> Response:
+    """Show the editor.
+
+    Parameters
+    ----------
+    version : version of the file on which the typed text is based.
+    now : current text of the file, if somebody has changed it since.
+    """
+    saved = "saved" in ask.request.query_params
+    page = RubricPage(
+        file=path,
+        typed=typed,
+        seen=version,
+        now=now,
+        saved=saved,
+        classes=[(n, name_place(place)) for n, place in enumerate(ask.user.gradebooks)],
+        graded=_classes_of(ask, path) if saved else [],
+    )
+    return ask.page("rubric", status=status, title=path.name, page=page)
+
+
+def _classes_of(ask: PageRequest, path: Path) -> list[tuple[int, str, Run | None]]:
+    """Return the open classes graded by a rubric file, with what was graded last in each."""
+    found = []
+    for n, place in enumerate(ask.user.gradebooks):
+        try:
+            book = ask.desk.gradebooks.gradebook(place)
+            assignment, anonymous = book.assignment, book.rubric.anonymous
+        except ConfigError:  # nothing is graded there yet, or the gradebook is gone
+            continue
+        if assignment == path.stem and isinstance(place, Path):
+            run = last_run(ask.user, place)
+            if run and anonymous:  # the paths may contain names
+                run = replace(run, paths=())
+            found.append((n, name_place(place), run))
+    return found
+
+
+def _read_rubric_path(ask: PageRequest) -> Path:
+    """Return the path of the rubric that the request names, or an unused one for a new rubric.
+
+    Raises
+    ------
+    ConfigError : the path is not a TOML file in an existing folder that this person may use.
+    """
+    typed = ask.text("file")
+    if not typed and ask.request.method == "GET":
+        typed = _free_name(ask.user.workshop or find_root())
+    wanted = "enter a file name for the rubric, such as rubric.toml"
+    path = read_path(typed, wanted=wanted, inside=ask.user.workshop)
+    if path.suffix != ".toml":
+        raise ConfigError(f"{path}: a rubric is a .toml file")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{path}: the folder {path.parent} does not exist")
+    return path
+
+
+# --------------------------------------------------------------------------- the preview
+
+_BARS = re.compile(r"[0-9]{1,5}(\.[0-9]{1,5}){1,49}")  # the bars in an address: "0.2.5.1"
+_ROWS = 30  # rows shown at once; the other rows are folded
+
+
+@dataclass(frozen=True, kw_only=True)
+class RubricPreviewPage:
+    """What the preview shows: the points of a class under a rubric that is not saved yet.
+
+    Attributes
+    ----------
+    text, seen : the typed rubric, and the version of the file on which it is based.
+    number, called : number and name of the class.
+    found : the preview; see `RubricPreview`.
+    teams : all teams, the largest change first.
+    is_of : whether the class was graded by the file of this rubric.
+    titles : the title of each criterion by its id.
+    """
+
+    file: Path
+    text: str
+    seen: str
+    number: int
+    called: str
+    found: Mapping[str, Any]
+    teams: Sequence[Mapping[str, Any]]
+    is_of: bool
+    titles: Mapping[str, str]
+
+    @property
+    def changed(self) -> list[Mapping[str, Any]]:
+        """The teams with any change."""
+        return [one for one in self.teams if one["criteria"] or one["gain"] or one["late"]]
+
+    @property
+    def first(self) -> list[Mapping[str, Any]]:
+        """The changed teams that are shown at once."""
+        return self.changed[:_ROWS]
+
+    @property
+    def rest(self) -> list[Mapping[str, Any]]:
+        """The changed teams that are folded."""
+        return self.changed[_ROWS:]
+
+    @property
+    def means(self) -> list[float]:
+        """The mean of the points before and after."""
+        each = ([team[key] for team in self.teams] for key in ("before", "after"))
+        return [sum(points) / len(points) for points in each]
+
+    @property
+    def drawn(self) -> str:
+        """The bars of both distributions, as the query of an address."""
+        bars = {key: map(str, self.found[f"bars_{key}"]) for key in ("before", "after")}
+        return "&".join(f"{key}={'.'.join(counts)}" for key, counts in bars.items())
+
+
+def preview(ask: PageRequest) -> Response:
+    """Show the points of a class under the typed rubric; nothing is saved."""
+    path, typed, seen = _read_rubric_path(ask), read_draft(ask.form), ask.text("seen")
+    if typed.rubric is None:
+        return _show_editor(ask, path, typed, version=seen, status=422)
+    number, place = _find_class(ask)
+    found = ask.desk.workers.do("preview_rubric", folder=str(place), text=typed.text)
+    page = RubricPreviewPage(
+        file=path,
+        text=typed.text,
+        seen=seen,
+        number=number,
+        called=name_place(place),
+        found=found,
+        teams=_name_teams(ask, place, found["teams"]),
+        is_of=found["assignment"] == path.stem,
+        titles={c.id: c.title or c.id for c in typed.rubric.criteria},
+    )
+    return ask.page("rubric_preview", title=f"{path.name}: preview", page=page)
+
+
+def draw_preview(ask: PageRequest) -> Response:
+    """Draw two distributions, whose bars are in the URL."""
+    before, after = (_read_bars(ask.query(key)) for key in ("before", "after"))
+    if len(before) != len(after):
+        raise HTTPException(404, "there is no such drawing")
+    with drawing():
+        figure = two_distributions_figure(before, after)
+        alt = "Histograms of the points, before and after."
+        return show_drawing(
+            render_drawing(plain_svg(to_svg(figure, name="distributions", alt=alt)))
+        )
+
+
+def _read_bars(text: str) -> list[int]:
+    if not _BARS.fullmatch(text):
+        raise HTTPException(404, "there is no such drawing")
+    return [int(part) for part in text.split(".")]
+
+
+def _find_class(ask: PageRequest) -> tuple[int, Place]:
+    typed = ask.text("class")
+    books = ask.user.gradebooks
+    if not typed.isascii() or not typed.isdecimal() or len(typed) > 6 or int(typed) >= len(books):
+        raise HTTPException(404, "this class is not open at the desk")
+    return int(typed), books[int(typed)]
+
+
+def _name_teams(
+    ask: PageRequest, place: Place, teams: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Return the changes with the names that the class shows, the largest change first."""
+    names = ask.desk.gradebooks.of(place).names
+    shown = [
+        {
+            **team,
+            "name": team["submission"] if names is None else names[team["submission"]],
+            "gain": round(team["after"] - team["before"], 6),
+            "late": team["late_before"] != team["late_after"],
+        }
+        for team in teams
+    ]
+    return sorted(shown, key=lambda team: (-abs(team["gain"]), team["name"]))
