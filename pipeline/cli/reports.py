@@ -165,19 +165,26 @@ def run_report(
 ) -> "Analysis":
     """Write the report of a submission and print a short summary.
 
-    A second process loads what draws the report while this one loads what analyses the data.
+    A second process loads what draws the report while this one loads what analyses the data. The
+    desk shows a complete report in the submission's own folder as one of its own.
     """
     with SecondProcess("pipeline.report.lab_report.content", "make_draft") as second:
+        from pipeline.desk.last_report import stat_sources, write_findings
         from pipeline.output import named_folder, own_folder
         from pipeline.report.lab_report.write import make_report
 
+        # Note the state before the files are read, so that the desk notices a later change.
+        made_of = stat_sources(folder)
         submission = _load(folder)
+        is_for_desk = out is None and files.pdf
         out = named_folder(out) if out else own_folder(submission.folder, "report")
         compared = _comparison(compare, submission)
         with progress_line() as progress:
-            analysis, _, draft = make_report(
+            analysis, changes, draft = make_report(
                 submission, out, compared=compared, make=second.do, files=files, progress=progress
             )
+        if is_for_desk:
+            write_findings(analysis, out, changes=changes, made_of=made_of)
     for line in (draft.summary, *_unreadable(analysis), *draft.remarks):
         say(line)
     say(_wrote(out, "report", pdf=files.pdf))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import escape
+from markupsafe import Markup, escape
 from starlette.datastructures import FormData, QueryParams
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -292,6 +292,9 @@ _ADDRESS = re.compile(
     r'\b(href|src|action|formaction|hx-get|hx-post|data-events|data-page)="/(?!/)'
 )
 
+# A parameter, as `symbol_text` writes it.
+_INDEX = re.compile(r"(?<!\w)([KTωζ])_(\w+)")
+
 
 @cache
 def _environment() -> Environment:
@@ -302,11 +305,21 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"called": name_place, "breakable": breakable, "points": points_text}
+    environment.filters |= {
+        "called": name_place,
+        "breakable": breakable,
+        "points": points_text,
+        "lowered": lower_indices,
+    }
     # This random number in the addresses of style sheets and scripts keeps browsers from using old
     # copies.
     environment.globals["fresh"] = secrets.token_hex(4)
     return environment
+
+
+def lower_indices(text: str) -> Markup:
+    """Return a text as HTML in which the indices of parameters are lowered, as in ω_n."""
+    return Markup(_INDEX.sub(r"\1<sub>\2</sub>", str(escape(text))))
 
 
 def prepare_pages() -> None:

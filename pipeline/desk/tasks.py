@@ -19,7 +19,7 @@ from pipeline.desk.exercises import (
     make_solution,
 )
 from pipeline.desk.form_input import keep_refusal, read_path
-from pipeline.desk.last_report import FINDINGS, PLOTS_OF, stat_sources
+from pipeline.desk.last_report import PLOTS_OF, stat_sources, write_findings
 from pipeline.desk.student.folder_tasks import FOLDER_TASKS
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.identify.springs import fill_folder
@@ -36,7 +36,7 @@ from pipeline.ingest.read import read_data
 from pipeline.lock import lock_or_refuse
 from pipeline.output import own_folder, write_file
 from pipeline.processes import serve
-from pipeline.results import Analysis, Assumption
+from pipeline.results import Analysis
 from pipeline.submission import load_submission
 from pipeline.submission.load import path_problem
 from pipeline.words.progress import Progress
@@ -82,22 +82,9 @@ def fill_tables(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
 
 def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
     """Write the report into the submission's folder, and compare it with the previous one."""
-    from pipeline.report.lab_report.changes import changes_line, compare_drafts, read_results
+    from pipeline.report.lab_report.changes import compare_drafts, read_results
     from pipeline.report.lab_report.content import make_draft
     from pipeline.report.lab_report.write import make_report as write_report
-    from pipeline.report.sections.housekeeping import taken_text
-    from pipeline.report.sections.questions import ask
-    from pipeline.words.text import with_symbols
-
-    def describe(one: Assumption) -> dict[str, Any]:
-        return {
-            "key": one.key,
-            "about": one.about,
-            "value": one.value,
-            "support": one.support,
-            "taken": taken_text(one),
-            "why": with_symbols(one.reason),
-        }
 
     # Note the state before the files are read, so that a later change is noticed.
     made_of = stat_sources(Path(folder))
@@ -114,28 +101,7 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
         analysis, changes, _ = write_report(
             submission, out, compared=compared, make=make_draft, progress=progress
         )
-        asked = [
-            {"id": one.id, "section": one.section, "text": with_symbols(one.text)}
-            for one in ask(analysis)
-        ]
-        findings = {
-            "questions": asked,
-            "assumed": [describe(one) for one in analysis.assumptions if one.origin != "stated"],
-            "contradicted": [
-                describe(one) for one in analysis.assumptions if one.support == "contradicted"
-            ],
-            "changes": with_symbols(changes_line(changes)) if changes else "",
-            "failed": [with_symbols(check.message) for check in analysis.failed_checks],
-            "turned": {
-                one.id: 1 if one.input_scale > 0 else -1
-                for one in analysis.records
-                if one.sign_reversed
-            },
-            "unreadable": dict(analysis.unreadable),
-            "made_of": made_of,
-        }
-        write_file(out / FINDINGS, json.dumps(findings, ensure_ascii=False))
-    return findings
+        return write_findings(analysis, out, changes=changes, made_of=made_of)
 
 
 def make_gap(folder: str, *, progress: Progress) -> None:

@@ -39,8 +39,8 @@ class Field:
     path : path of the key in the file; tables in a list have their number.
     input : name of the HTML input, if it is not the path.
     kind : text, number, numbers, rows (of numbers, one per line), flags, authors, columns, words
-        (a text of several lines), amount (a number whose digits say nothing, so it is written in
-        its shortest form), or share (an amount in percent, which the file stores as a fraction).
+        (a text of several lines), amount (a number that is written in its shortest form), or share
+        (an amount in percent that the file stores as a fraction).
     unit : the unit of an amount.
     choices : the possible values; "" means that the key is left out.
     names : the names of the flags.
@@ -141,7 +141,7 @@ def _list_choices(values: Sequence[Mapping[str, Any]], *, first: Sequence[Any]) 
 
 
 def find_value(document: Any, path: str) -> Any:
-    """Return the value at a path of a document; None if there is none."""
+    """Return the value at a path of a document; None if the path leads nowhere."""
     here = document
     for part in path.split("."):
         try:
@@ -325,7 +325,7 @@ def set_item(document: Any, parts: Sequence[str], item: Item | None) -> None:
 def _add_key(table: Table, key: str, item: Item) -> None:
     """Add a key below the last one of a table, above the comments before the next heading.
 
-    In a table without keys, it stands below the comments that follow the heading.
+    A table without keys gets it after the comments that follow the heading.
     """
     body = table.value.body
     keys = [place for place, (name, _) in enumerate(body) if name is not None]

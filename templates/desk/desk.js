@@ -68,6 +68,7 @@ const unfold = (one) => around(one.closest("details")).forEach((folded) => (fold
 document.addEventListener("htmx:beforeSend", ({ detail }) => {
   const form = detail.elt.closest("form");
   if (form) for (const one of typed(form)) sent.set(one, state(one));
+  if (waiting && form?.dataset.row === waiting.row && detail.requestConfig.formData.has(waiting.name)) waiting = null;
 });
 document.addEventListener("htmx:sendError", () => {
   sent = new WeakMap();
@@ -103,8 +104,31 @@ document.addEventListener("htmx:afterSwap", ({ detail }) => {
 });
 // A row saves itself when a field is left: also if the answer to an earlier change was on the way then.
 const changed = new Set();
-document.addEventListener("change", (event) => changed.add(key(event.target)), true);
+// A button of the row that leaves the field sends the field too. Until it is released, the row must not be replaced under it.
+let pressed = null, held = null;
+document.addEventListener("pointerdown", (event) => (pressed = event.target.closest?.("[data-row] button")?.form), true);
+document.addEventListener("change", (event) => {
+  if (!pressed || event.target.form !== pressed) return changed.add(key(event.target));
+  event.stopPropagation();
+  held = event.target;
+}, true);
+for (const release of ["pointerup", "pointercancel"]) document.addEventListener(release, () => {
+  const one = held;
+  pressed = held = null;
+  if (one) setTimeout(() => one.isConnected && unsaved(one) && one.dispatchEvent(new Event("change", { bubbles: true })));
+}, true);
+// A button of a row that is pressed while an earlier answer is on the way would be replaced before its turn: it is pressed again.
+let waiting = null;
+document.addEventListener("submit", ({ target, submitter }) => {
+  const { row } = target.dataset;
+  if (!row || !submitter?.name) return;
+  const [form, name, value] = [row, submitter.name, submitter.value].map(CSS.escape);
+  waiting = { row, name: submitter.name, button: `[data-row=${form}] [name=${name}][value=${value}]` };
+}, true);
 document.addEventListener("htmx:afterSettle", () => {
+  const lost = waiting && document.querySelector(waiting.button);
+  waiting = null;
+  if (lost) return lost.click();
   const again = rows.splice(0).filter((one) => changed.has(key(one)) || one === document.activeElement);
   changed.clear();
   for (const one of again) {

@@ -9,7 +9,7 @@ from urllib.parse import urlencode
 
 import pytest
 
-from pipeline.desk.instructor.rubric_pages import own_rubrics
+from pipeline.desk.instructor.rubric_list import own_rubrics
 from pipeline.desk.users import User
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS

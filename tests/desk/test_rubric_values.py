@@ -128,7 +128,7 @@ def test_a_table_without_a_heading_is_changed_in_its_place(late, changed):
 
 
 def test_a_new_key_stands_above_the_comments_of_the_next_table():
-    """A new key stands below the last key of its table, above a comment of the next heading."""
+    """A new key follows the last key of its table; a comment of the next heading comes later."""
     text = ONE.replace("[late]", "# an hour counts as a day\n[late]")
     new = typed_into(text, flags__hz_for_rad_s="50")
     assert new == text.replace("data_problem = 0.25\n", "data_problem = 0.25\nhz_for_rad_s = 0.5\n")

@@ -549,3 +549,31 @@ def test_typing_goes_on_while_a_field_is_saved(show, tmp_path):
 
         until(is_saved)
         expect(window.get_by_text("Saved.").first).to_be_visible()
+
+
+@pytest.mark.usefixtures("work_here")
+@pytest.mark.parametrize("press", ["click", "hold", "during the answer"])
+def test_a_press_on_remove_counts_while_a_note_is_saved(show, tmp_path, press):
+    """A row is removed if Remove is pressed right after a note of it was typed.
+
+    A long press counts too, and so does one while the note is on its way.
+    """
+    folder = a_submission(tmp_path / "team")
+    left = [one.id for one in load_submission(folder).experiments[1:]]
+    with DeskServer(folder=folder) as server:
+        window = show(server.url)
+        window.locator("#kind-decay > summary").click()
+        window.locator("#more-0 > summary").click()
+        note = window.locator("#experiments-0-note")
+        remove = window.locator("#row-0").get_by_role("button", name="Remove")
+        note.press_sequentially("bumped")
+        if press == "click":
+            remove.click()
+        elif press == "hold":
+            remove.hover()
+            window.mouse.down()
+            window.wait_for_timeout(1_000)  # longer than an answer takes
+            window.mouse.up()
+        else:
+            remove.evaluate("remove => { document.activeElement.blur(); remove.click(); }")
+        until(lambda: [one.id for one in load_submission(folder).experiments] == left)

@@ -4,7 +4,7 @@ The editor has a form for the numbers next to the text. A rubric that is not val
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,17 +13,23 @@ from urllib.parse import urlencode
 from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 
-from pipeline.desk.browse import find_root
 from pipeline.desk.form_input import read_path
 from pipeline.desk.grades.grading_form import last_run
 from pipeline.desk.instructor.rubric_form import RubricDraft, make_draft, read_draft
+from pipeline.desk.instructor.rubric_list import (
+    ListedRubric,
+    free_name,
+    own_rubrics,
+    shipped_names,
+    shipped_rubrics,
+    work_folder,
+)
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
-from pipeline.desk.users import Place, User, name_place
+from pipeline.desk.users import Place, name_place
 from pipeline.errors import ConfigError
 from pipeline.grading.intake.repairs import Run
-from pipeline.grading.rubric import Rubric
-from pipeline.grading.rubric_file import parse_rubric, rubric_source
+from pipeline.grading.rubric_file import rubric_source
 from pipeline.grading.rubric_text import rubric_text
 from pipeline.output import write_file
 from pipeline.report.figures.grading import two_distributions_figure
@@ -36,102 +42,12 @@ from pipeline.submission.edit import Stale, require_version, text_digest
 _NEW = "new"  # version in a form whose file does not exist yet
 
 
-# --------------------------------------------------------------------------- the list
-
-_MOST = 40  # files listed
-_LOOKED_AT = 2_000  # TOML files of a folder that are checked
-_MARK = "[[criteria]]"
-_START = 200_000  # a rubric contains _MARK within this many characters
-
-
 @dataclass(frozen=True, kw_only=True)
-class ListedRubric:
-    """A rubric in the list.
-
-    Attributes
-    ----------
-    rubric : content of the file; None if it has mistakes.
-    """
-
-    name: str
-    path: Path
-    rubric: Rubric | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class RubricList:
+class RubricListPage:
     """What the list of rubrics shows: the shipped ones, and those in the instructor's folders."""
 
     shipped: Sequence[ListedRubric]
     own: Sequence[ListedRubric]
-
-
-def _shipped_names() -> list[str]:
-    return sorted(path.stem for path in RUBRICS.glob("*.toml"))
-
-
-def _shipped_rubrics() -> list[ListedRubric]:
-    found = (_list_rubric(RUBRICS / f"{name}.toml", name) for name in _shipped_names())
-    return [one for one in found if one is not None]
-
-
-def own_rubrics(user: User) -> list[ListedRubric]:
-    """Return the rubrics in a user's workshop.
-
-    The owner has no workshop. They get the rubrics near the open folders, and those in the folder
-    in which the desk was started.
-    """
-    found: dict[Path, ListedRubric] = {}
-    for root in _roots(user):
-        for path in _toml_files(root):
-            listed = _list_rubric(path, path.relative_to(root).as_posix())
-            if listed is not None and len(found) < _MOST:
-                found.setdefault(path.resolve(), listed)
-    return list(found.values())
-
-
-def _free_name(folder: Path) -> str:
-    """Return a file name that is still free in a folder: `rubric.toml`, `rubric-2.toml`, …"""
-    names = ("rubric.toml", *(f"rubric-{n}.toml" for n in range(2, 1000)))
-    return next((name for name in names if not (folder / name).exists()), "rubric.toml")
-
-
-def _roots(user: User) -> Sequence[Path]:
-    if user.workshop:
-        return (user.workshop,)
-    places = (place for place in (*user.gradebooks, *user.folders) if isinstance(place, Path))
-    return tuple(dict.fromkeys([find_root(), *(place.parent for place in places)]))
-
-
-def _toml_files(root: Path) -> Iterator[Path]:
-    """Yield the TOML files of a folder and of its direct subfolders."""
-    for pattern in ("*.toml", "*/*.toml"):
-        try:
-            found = sorted(root.glob(pattern))[:_LOOKED_AT]
-        except OSError:
-            continue
-        for path in found:
-            hidden = any(part.startswith(".") for part in path.relative_to(root).parts)
-            shipped = path.resolve().parent == RUBRICS.resolve()
-            if hidden or shipped or not path.is_file():
-                continue
-            if path.resolve().is_relative_to(root.resolve()):
-                yield path
-
-
-def _list_rubric(path: Path, name: str) -> ListedRubric | None:
-    """Return a file as an entry of the list; None if it is not a rubric."""
-    try:
-        text = rubric_source(path)
-    except ConfigError:
-        return None
-    if _MARK not in text[:_START]:
-        return None
-    try:
-        rubric = parse_rubric(text, where=path.name)
-    except ConfigError:
-        rubric = None
-    return ListedRubric(name=name, path=path, rubric=rubric)
 
 
 # --------------------------------------------------------------------------- the editor
@@ -176,13 +92,13 @@ def show(ask: PageRequest) -> Response:
     """
     start = ask.text("start")
     if not start and not ask.text("file"):
-        page = RubricList(shipped=_shipped_rubrics(), own=own_rubrics(ask.user))
+        page = RubricListPage(shipped=shipped_rubrics(), own=own_rubrics(ask.user))
         return ask.page("rubrics", title="Rubrics", page=page)
     path = _read_rubric_path(ask)
     if path.exists():
         text = rubric_source(path)
         return _show_editor(ask, path, make_draft(text, {}), version=text_digest(text))
-    text = rubric_source(RUBRICS / f"{start}.toml") if start in _shipped_names() else ""
+    text = rubric_source(RUBRICS / f"{start}.toml") if start in shipped_names() else ""
     return _show_editor(ask, path, make_draft(text, {}), version=_NEW)
 
 
@@ -264,7 +180,7 @@ def _read_rubric_path(ask: PageRequest) -> Path:
     """
     typed = ask.text("file")
     if not typed and ask.request.method == "GET":
-        typed = _free_name(ask.user.workshop or find_root())
+        typed = free_name(work_folder(ask.user))
     wanted = "enter a file name for the rubric, such as rubric.toml"
     path = read_path(typed, wanted=wanted, inside=ask.user.workshop)
     if path.suffix != ".toml":
@@ -282,7 +198,7 @@ _ROWS = 30  # rows shown at once; the other rows are folded
 
 @dataclass(frozen=True, kw_only=True)
 class RubricPreviewPage:
-    """What the preview shows: the points of a class under a rubric that is not saved yet.
+    """The data of the preview: the points of a class under a rubric that is not saved yet.
 
     Attributes
     ----------
