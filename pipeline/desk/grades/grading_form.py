@@ -161,11 +161,13 @@ def _list_rubrics(user: User) -> list[tuple[str, str]]:
 
 def _typed(ask: PageRequest, *, wrong: Mapping[str, str], is_first: bool) -> GradingForm:
     """Return the form as it was typed."""
-    typed = {name: ask.text(name) for name in ("paths", "rubric", "lateness", "out")}
     if _uploads(ask):
         wrong = {"files": "choose the files once more", **wrong}
     return GradingForm(
-        **typed,
+        paths=ask.text("paths"),
+        rubric=ask.text("rubric"),
+        lateness=ask.text("lateness"),
+        out=ask.text("out"),
         anonymous=bool(ask.text("anonymous")),
         is_first=is_first,
         rubrics=_list_rubrics(ask.user),
