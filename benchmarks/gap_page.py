@@ -37,8 +37,7 @@ from pipeline.output import write_file
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.effect import AugmentedChain
 from pipeline.report.figures.gap import before_after_figure
-from pipeline.report.figures.style import drawing
-from pipeline.report.figures.svg import plain_svg, to_svg
+from pipeline.report.figures.style import drawing, to_svg
 from pipeline.results import Record
 from pipeline.setup import Setup, Units
 
@@ -313,7 +312,7 @@ def _draw(trace: Trace, study: Study, file: str) -> None:
         figure = before_after_figure(replace(trace, **thin), noise=noise, position_unit="count")
         svg = to_svg(figure, name=file, alt=f"{trace.experiment}, cart {trace.cart}")
     FIGURES.mkdir(exist_ok=True)
-    write_file(FIGURES / file, plain_svg(svg))
+    write_file(FIGURES / file, svg)
 
 
 # --------------------------------------------------------------------------- the page

@@ -30,8 +30,7 @@ from pipeline.experiments.propose import FURTHEST, propose_plan, renamed, rounde
 from pipeline.output import write_file
 from pipeline.plant.chain import PRESETS, Array, Chain
 from pipeline.plant.simulate import SETTLED, SETTLED_DWELL, settling_wait, steady_time
-from pipeline.report.figures.style import drawing, legend_above, small_multiples
-from pipeline.report.figures.svg import plain_svg, to_svg
+from pipeline.report.figures.style import drawing, legend_above, small_multiples, to_svg
 from pipeline.results import Analysis
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
@@ -139,7 +138,7 @@ def draw(results: dict[str, list[tuple[list[Stage], Array]]]) -> str:
         panels[0].set_xlim(0.0)
         panels[0].set_ylabel("worst standard error in %")
         legend_above(panels[0])
-        return plain_svg(to_svg(figure, name="next", alt="worst standard error against bench time"))
+        return to_svg(figure, name="next", alt="worst standard error against bench time")
 
 
 def main() -> None:

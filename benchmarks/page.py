@@ -24,8 +24,7 @@ from matplotlib.figure import Figure
 from pipeline import __version__
 from pipeline.arrays import Array
 from pipeline.output import write_file
-from pipeline.report.figures.style import drawing
-from pipeline.report.figures.svg import plain_svg, to_svg
+from pipeline.report.figures.style import drawing, to_svg
 
 NOT_INSTALLED = "not installed"
 _BASIC = ("numpy", "scipy", "numba")
@@ -125,7 +124,7 @@ def section(
             parts.append(markdown(table))
         if table.picture is not None:
             with drawing():
-                drawn = plain_svg(to_svg(table.picture(), name=f"{name}-{number}", alt=table.title))
+                drawn = to_svg(table.picture(), name=f"{name}-{number}", alt=table.title)
             if figures is not None:
                 figures.mkdir(parents=True, exist_ok=True)
                 write_file(figures / f"{name}-{number}.svg", drawn)

@@ -17,8 +17,8 @@ import tomlkit
 from matplotlib.figure import Figure
 
 from benchmarks.page import Table, installed, missing, spread
-from pipeline.report.figures.colours import MODEL, SECOND
-from pipeline.report.figures.style import legend_above, panels
+from pipeline.report.figures import MODEL, SECOND
+from pipeline.report.figures.style import legend_above, log_scale, panels
 from pipeline.resources import EXAMPLES
 from pipeline.simulated.submission import write_submission
 from pipeline.submission.load import NAME
@@ -129,8 +129,7 @@ def by_records(base: Path, *, records: Sequence[int]) -> Table:
             line = np.geomspace(records[0], records[-1])
             ax.plot(line, level + slope * line, color=SECOND, ls="--", label="straight line")
             ax.plot(records, values, "o", color=MODEL, label="measured")
-            ax.set_xscale("log")
-            ax.set_yscale("log")
+            log_scale(ax, "x", "y")
             ax.set_ylabel(unit)
         below.set_xlabel("records")
         legend_above(above)

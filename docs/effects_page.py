@@ -12,7 +12,6 @@ from pipeline.report.builder import PageBuilder
 from pipeline.report.effects.catalogue import parameter_text
 from pipeline.report.effects.gallery import BENCH, effect_picture, hiding_option
 from pipeline.report.figures.style import drawing
-from pipeline.report.figures.svg import plain_svg
 from pipeline.simulated.hidden import usual_term
 from pipeline.words.math import to_tex
 from pipeline.words.phrases import phrases
@@ -30,7 +29,7 @@ def main() -> None:
         for effect in CATALOGUE:
             term = usual_term(effect, PRESETS[BENCH])
             picture = effect_picture(PageBuilder(), term, PRESETS[BENCH], bench=BENCH)
-            write_file(DOCS / IMAGES / f"{effect.key}.svg", plain_svg(picture.svg))
+            write_file(DOCS / IMAGES / f"{effect.key}.svg", picture.svg)
 
 
 def effects_page() -> str:

@@ -11,7 +11,6 @@ from playwright.sync_api import ViewportSize, sync_playwright
 from pipeline.cli.demo import demo
 from pipeline.desk.app import DeskServer
 from pipeline.output import write_file
-from pipeline.report.figures.svg import plain_svg
 from pipeline.report.lab_report.content import build_document
 from pipeline.report.solution.write import build_solution
 from pipeline.simulated.hidden import prepare_bench
@@ -62,7 +61,7 @@ def tutorials(out: Path) -> None:
     for document in (build_document(analysis), build_solution(analysis)):
         for picture in document.pictures():
             if picture.name in FIGURES:
-                write_file(IMAGES / FIGURES[picture.name], plain_svg(picture.svg))
+                write_file(IMAGES / FIGURES[picture.name], picture.svg)
 
 
 def gallery(made: Path) -> None:

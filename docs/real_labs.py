@@ -22,8 +22,7 @@ from benchmarks.silverbox import INTERVAL, TRAIN
 from pipeline.cli.reports import explain, run_report
 from pipeline.gap.types import Gap, read_gap
 from pipeline.output import write_file
-from pipeline.report.figures.style import drawing, panels
-from pipeline.report.figures.svg import plain_svg, to_svg
+from pipeline.report.figures.style import drawing, panels, to_svg
 from pipeline.report.lab_report.write import Files
 from pipeline.results import Analysis, LogDecrement
 from pipeline.words.numbers import with_error
@@ -231,7 +230,7 @@ def draw_limit_cycle() -> None:
         ax.set_xlabel("time [s]")
         ax.set_ylabel("cart 1 [count]")
         svg = to_svg(figure, name="limit-cycle", alt="cart 1 swings more and more, then decays")
-    write_file(IMAGES / "real-day-limit-cycle.svg", plain_svg(svg))
+    write_file(IMAGES / "real-day-limit-cycle.svg", svg)
 
 
 if __name__ == "__main__":

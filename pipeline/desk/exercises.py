@@ -46,12 +46,11 @@ def draw_effect(bench: Mapping[str, str], hide: str, *, progress: Progress) -> s
     from pipeline.report.builder import PageBuilder
     from pipeline.report.effects.gallery import effect_picture
     from pipeline.report.figures.style import drawing
-    from pipeline.report.figures.svg import plain_svg
 
     hidden = _prepare(bench, [hide])
     with drawing():
         picture = effect_picture(PageBuilder(), hidden.effects[-1], hidden.chain, bench=hidden.name)
-    return plain_svg(picture.svg)
+    return picture.svg
 
 
 def make_exercises(

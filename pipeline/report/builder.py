@@ -18,8 +18,7 @@ from pipeline.report.document import (
     bullet_list,
     make_table,
 )
-from pipeline.report.figures.style import drawing
-from pipeline.report.figures.svg import to_svg
+from pipeline.report.figures.style import drawing, to_svg
 from pipeline.results import Analysis, Record
 from pipeline.setup import Units
 from pipeline.words.numbers import count

@@ -24,8 +24,7 @@ from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.identities import transfer_functions
 from pipeline.report.figures.grading import reported_bode_figure
-from pipeline.report.figures.style import drawing
-from pipeline.report.figures.svg import to_svg
+from pipeline.report.figures.style import drawing, to_svg
 from pipeline.resources import RUBRICS
 from pipeline.results import FrequencyResponse
 from pipeline.setup import PAPER_UNITS

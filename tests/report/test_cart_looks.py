@@ -2,7 +2,7 @@
 
 import re
 
-from pipeline.report.figures.colours import CARTS, MEASURED, MODEL, SECOND, THIRD
+from pipeline.report.figures import CARTS, MEASURED, MODEL, SECOND, THIRD
 from pipeline.resources import TEMPLATES
 
 ROLES = {MODEL: "model", SECOND: "second", THIRD: "third", MEASURED: "ink"}

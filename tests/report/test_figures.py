@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-from base64 import b64decode
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
@@ -13,7 +12,7 @@ from xml.etree import ElementTree
 import matplotlib
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -25,21 +24,21 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pipeline.gap.residual import ResidualForce
 from pipeline.plant.chain import Chain
 from pipeline.report.builder import Page
+from pipeline.report.figures import CARTS, MEASURED, QUIET
 from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
-from pipeline.report.figures.colours import CARTS, MEASURED, QUIET
 from pipeline.report.figures.gap import force_figure, force_left_figure, timing_figure
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import (
     drawing,
+    log_scale,
     panels,
     plot_measured,
     plot_model,
     plot_points,
     small_multiples,
     thin,
+    to_svg,
 )
-from pipeline.report.figures.svg import plain_svg, to_svg
-from pipeline.report.figures.ticks import linear_ticks, log_ticks, tick_labels
 from pipeline.report.figures.time import (
     damping_figure,
     decay_figure,
@@ -263,32 +262,21 @@ def test_thinning_keeps_the_envelope(n, seed):
     assert thin_t.size <= 480
 
 
-@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(2, 9))
-def test_ticks_are_round_numbers_inside_the_axis(low, span, most):
-    """An axis has at least two ticks, evenly spaced by 1, 2 or 5 times a power of ten.
-
-    No tick is outside the axis.
-    """
-    high = low + span
-    assume(span > 1e-9 * abs(low))
-    ticks = linear_ticks(low, high, most=most)
-    step = ticks[1] - ticks[0]
-    assert ticks.size >= 2
-    assert ticks[0] >= low - 1e-8 * step
-    assert ticks[-1] <= high + 1e-8 * step
-    mantissa = step / 10.0 ** np.floor(np.log10(step * (1 + 1e-6)))
-    # Rounding: the step is a difference of numbers up to 1e9 times larger.
-    assert min(abs(mantissa - m) for m in (1, 2, 5)) < 1e-5 * (1 + abs(low) / step * 1e-9)
-
-
-def test_tick_labels_share_their_decimals():
-    """All labels of an axis have the same number of decimals and a true minus sign."""
-    assert tick_labels(np.array([-0.5, 0.0, 0.5])) == ["−0.5", "0.0", "0.5"]
-    assert tick_labels(np.array([-200.0, 0.0])) == ["−200", "0"]
-    assert tick_labels(log_ticks(0.4, 7.0)) == ["0.5", "1", "2", "5"]
-    assert tick_labels(log_ticks(8.0, 27.0)) == ["10", "15", "20"]
-    assert tick_labels(log_ticks(0.05, 900.0)) == ["0.1", "1", "10", "100"]
-    assert tick_labels(np.array([0.0, 5e-6])) == ["0", "5e−06"]
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [
+        ((0.4, 7.0), ["0.5", "1", "2", "5"]),
+        ((8.0, 27.0), ["10", "15", "20"]),
+        ((0.05, 900.0), ["0.1", "1", "10", "100"]),
+    ],
+)
+def test_a_logarithmic_axis_has_round_numbers(limits, expected):
+    """A logarithmic axis is labelled at round numbers, more of them over fewer decades."""
+    with drawing():
+        figure, (ax,) = panels(2.0)
+        log_scale(ax, "y")
+        ax.set_ylim(*limits)
+    assert [f"{one:g}" for one in labels(figure, ax)] == expected
 
 
 def test_the_users_matplotlib_settings_do_not_matter():
@@ -376,18 +364,30 @@ def figures_of(carts: int) -> dict[str, Figure]:
     }  # fmt: skip
 
 
+def tick_labels_out_of_view(figure: Figure) -> list[Text]:
+    """Return the labels that matplotlib has made but does not draw."""
+    unseen = []
+    for axis in (axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)):
+        low, high = sorted(axis.get_view_interval())
+        for tick in axis.get_major_ticks():
+            if not axis.get_visible() or not low <= tick.get_loc() <= high:
+                unseen.append(tick.label1)
+    return unseen
+
+
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_no_text_of_a_figure_is_cut_or_covered(carts):
     """All text in a figure lies on the canvas, and no two texts overlap."""
     with drawing():
         for name, figure in figures_of(carts).items():
-            to_svg(figure, name=name, alt="")  # draws the ticks
             canvas = FigureCanvasAgg(figure)
             renderer = canvas.get_renderer()
             canvas.draw()
+            unseen = tick_labels_out_of_view(figure)
             texts = [
                 text for text in figure.findobj(Text)
                 if isinstance(text, Text) and text.get_visible() and text.get_text()
+                and text not in unseen
             ]  # fmt: skip
             boxes = [(t.get_text(), t.get_window_extent(renderer)) for t in texts]
             assert len(boxes) > 8
@@ -399,32 +399,15 @@ def test_no_text_of_a_figure_is_cut_or_covered(carts):
                 assert apart.any(), (name, text, other)
 
 
-def test_a_figure_on_the_page_has_all_its_data():
-    """On the page, a figure stores every measured point; a plain SVG has only the points drawn."""
+def test_a_long_recording_gives_a_small_drawing():
+    """The points of a long recording are spread out, so its drawing stays small."""
     rng = np.random.default_rng(3)
-    t = np.linspace(0.0, 9.0, 5001)
-    y = rng.normal(size=t.size)
-    uneven = np.sort(rng.uniform(0.0, 9.0, 40))
+    t = np.linspace(0.0, 9.0, 50_001)
     with drawing():
         figure, (ax,) = panels(1.0)
-        plot_measured(ax, t, y)
-        plot_model(ax, uneven, np.sin(uneven), label="\"quoted\" <b> 'model'")
-        svg = to_svg(figure, name="x", alt="")
-
-    series = [g.attrib for g in ElementTree.fromstring(svg).iter() if "data-x" in g.attrib]
-    model, measured = sorted(series, key=lambda attributes: attributes["data-name"])
-    assert measured["data-name"] == "measured"
-    assert measured["data-x"] == "0 9"
-    # The numbers are stored as float32.
-    np.testing.assert_allclose(unpacked(measured["data-y"]), y, rtol=1e-6)
-    assert model["data-name"] == "\"quoted\" <b> 'model'"
-    np.testing.assert_allclose(unpacked(model["data-x"]), uneven, rtol=1e-6)
-    assert "data-" not in plain_svg(svg)
-    assert len(plain_svg(svg)) < 40_000
-
-
-def unpacked(text: str) -> np.ndarray:
-    return np.frombuffer(b64decode(text), dtype="<f4")
+        plot_measured(ax, t, rng.normal(size=t.size))
+        plot_model(ax, t, rng.normal(size=t.size))
+    assert len(drawn(figure)) < 40_000
 
 
 LONG = "DOF1_en1_input1_trial_of_monday_"
@@ -460,10 +443,11 @@ def test_a_phase_over_540_degrees_has_fewer_labels(least, step):
 
 
 def labels(figure: Figure, ax: Axes) -> list[float]:
-    """Return the numbers at the ticks of the vertical axis, which are drawn as text."""
+    """Return the numbers at the ticks of the vertical axis."""
     drawn(figure)
-    texts = [text.get_text() for text in ax.texts if text.get_gid() == "tick-y"]
-    return [float(text.replace("−", "-")) for text in texts]
+    low, high = ax.get_ylim()
+    seen = [text for text in ax.get_yticklabels() if low <= text.get_position()[1] <= high]
+    return [float(text.get_text().replace("−", "-")) for text in seen]
 
 
 def test_carts_of_a_step_have_different_markers():

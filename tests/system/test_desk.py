@@ -139,7 +139,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         window.get_by_role("link", name="Read the report").click()
         report = window.frame_locator("iframe")
         expect(report.get_by_role("heading", level=1)).to_have_text("One <b>cart</b>")
-        expect(report.locator("figure .tools").first).to_be_attached()  # the report's script works
+        expect(report.locator("button.copy").first).to_be_attached()  # the report's script works
         own = "document.documentElement.scrollHeight - innerHeight"
         assert window.evaluate(own) <= 0  # only the report scrolls, not the page around it
         assert fits(window)

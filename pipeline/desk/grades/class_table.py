@@ -30,8 +30,7 @@ from pipeline.grading.similarity.clusters import find_clusters, renamed
 from pipeline.grading.similarity.distant import find_distant, recomputed_numbers
 from pipeline.grading.words import WORDS, points_text, signed_points
 from pipeline.report.figures.grading import distribution_figure
-from pipeline.report.figures.style import drawing
-from pipeline.report.figures.svg import plain_svg, to_svg
+from pipeline.report.figures.style import drawing, to_svg
 from pipeline.report.render.html import render_drawing
 from pipeline.words.text import capital
 
@@ -213,7 +212,7 @@ def _distribution(shown: ClassView) -> str:
     with drawing():
         figure = distribution_figure(points, out_of=shown.rubric.out_of)
         alt = "Histogram of the points."
-        return render_drawing(plain_svg(to_svg(figure, name="distribution", alt=alt)))
+        return render_drawing(to_svg(figure, name="distribution", alt=alt))
 
 
 def show_class_page(ask: PageRequest) -> Response:

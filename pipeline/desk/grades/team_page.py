@@ -54,7 +54,6 @@ from pipeline.grading.publish.class_page import feedback_link
 from pipeline.grading.publish.view import view
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import WORDS, person_lines, points_text
-from pipeline.report.figures.svg import plain_svg
 from pipeline.report.render.html import render_drawing
 from pipeline.words.text import capital
 
@@ -171,7 +170,7 @@ def show_figure(ask: PageRequest) -> Response:
     name = ask.query("figure")
     if name not in drawn:
         raise HTTPException(404, "there is no such figure")
-    return show_drawing(render_drawing(plain_svg(drawn[name])))
+    return show_drawing(render_drawing(drawn[name]))
 
 
 def send_paper(ask: PageRequest) -> Response:

@@ -14,8 +14,7 @@ from pipeline.report.figures.grading import (
     reported_decay_figure,
     reported_step_figure,
 )
-from pipeline.report.figures.style import drawing
-from pipeline.report.figures.svg import to_svg
+from pipeline.report.figures.style import drawing, to_svg
 from pipeline.results import Analysis, Record
 from pipeline.submission import Reported
 from pipeline.words.text import clean, symbol_text

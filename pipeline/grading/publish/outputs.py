@@ -180,7 +180,7 @@ def _names(book: Gradebook, out: Path) -> dict[str, str]:
 
 def _digest_layout(rubric: Rubric) -> str:
     """Return a hash of everything that affects all pages, such as templates and the rubric."""
-    names = ("report.html.j2", "blocks.html.j2", "report.css", "page.js", "explore.js")
+    names = ("report.html.j2", "blocks.html.j2", "report.css", "page.js")
     parts = [(TEMPLATES / name).read_text(encoding="utf-8") for name in names]
     return _digest(*parts, rubric.model_dump_json())
 

@@ -16,8 +16,8 @@ from pipeline.report.builder import PageBuilder, Part
 from pipeline.report.document import Block, Code, Document, Picture, bullet_list, paragraph
 from pipeline.report.effects.catalogue import INPUT, POSITION, parameter_text
 from pipeline.report.equations.model import formula
-from pipeline.report.figures.colours import MODEL, QUIET, SECOND, SECOND_LINE
-from pipeline.report.figures.style import legend_above, panels, position_label
+from pipeline.report.figures import MODEL, QUIET, SECOND, SECOND_LINE
+from pipeline.report.figures.style import legend_above, log_scale, panels, position_label
 from pipeline.report.render.write import write_document
 from pipeline.simulated.hidden import usual_term
 from pipeline.words.numbers import significant, subscript
@@ -309,8 +309,7 @@ def _over_frequency(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart
     for y, colour, style in ((pulse.without, SECOND, "--"), (pulse.with_it, MODEL, "-")):
         gain = np.fft.rfft(y[cart - 1], padded)[band] / np.fft.rfft(u, padded)[band]
         ax.plot(hertz[band], np.abs(gain), color=colour, ls=style, lw=1.1)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
+    log_scale(ax, "x", "y")
     ax.set_xlabel("frequency [Hz]")
     ax.set_ylabel(f"x{subscript(cart)}/u [{POSITION}/{INPUT}]")
 

@@ -14,8 +14,8 @@ from pipeline.output import write_file
 from pipeline.report.builder import Page
 from pipeline.report.document import Block, Heading, Tile, Tiles, Tone, paragraph
 from pipeline.report.exploration import NAME
-from pipeline.report.figures.colours import QUIET, SECOND
-from pipeline.report.figures.style import legend_above, panels
+from pipeline.report.figures import QUIET, SECOND
+from pipeline.report.figures.style import legend_above, log_scale, panels
 from pipeline.report.gap.gap_report import before_after_picture
 from pipeline.report.gap.verdict import error_board, verdict_blocks, verdict_title
 from pipeline.report.render.html import render_html
@@ -150,7 +150,7 @@ def _whole_axes(ax: Axes, turns: Sequence[Turn], values: Sequence[float]) -> Non
     ax.set_xlabel("time at the bench [s]")
     exponents = np.log10([value for value in values if value > 0])
     low, high = np.floor(exponents.min()), np.ceil(exponents.max())
-    ax.set_yscale("log")
+    log_scale(ax, "y")
     ax.set_ylim(10.0**low, 10.0 ** max(high, low + 1))
 
 

@@ -10,9 +10,8 @@ from matplotlib.ticker import MultipleLocator
 from pipeline.arrays import Array
 from pipeline.names import mode_suffixes
 from pipeline.plant.chain import Chain
-from pipeline.report.figures.colours import CARTS, MEASURED, MODEL, QUIET
+from pipeline.report.figures import CARTS, MEASURED, MODEL, QUIET
 from pipeline.report.figures.style import legend_above, log_frequency_axis, panels, plot_line
-from pipeline.report.figures.svg import attach_data
 from pipeline.results import FrequencyResponse
 from pipeline.setup import Units
 from pipeline.words.numbers import subscript
@@ -66,15 +65,13 @@ def overview_figure(
         name = f"cart {response.cart}"
         colour, ls, *_ = CARTS[(response.cart - 1) % len(CARTS)]
         clear, decibel = response.has_signal, _decibel(response.magnitude)
-        for shown, edge, what in ((clear, colour, "measured"), (~clear, QUIET, _NOISE)):
+        for shown, edge in ((clear, colour), (~clear, QUIET)):
             if shown.any():
                 x, y = response.omega[shown], decibel[shown]
-                (points,) = ax.plot(x, y, "D", ms=3.2, mew=0.8, mfc="white", mec=edge)
-                attach_data(points, x, y, name=f"{name}, {what}")
+                ax.plot(x, y, "D", ms=3.2, mew=0.8, mfc="white", mec=edge)
         if chain:
             omega, line = _fitted(response, chain)
-            look = {"color": colour, "ls": ls}
-            plot_line(ax, omega, line, look, name=f"{name}, fit", in_legend=False)
+            plot_line(ax, omega, line, {"color": colour, "ls": ls})
         ax.plot([], [], "D", ls=ls if chain else "", ms=3.2, mfc="white", color=colour, label=name)
     if chain:
         _mark_modes(ax, every, chain)
@@ -110,8 +107,7 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
         omega = _dense(response.omega, chain)
         line = np.unwrap(np.angle(chain.frequency_response(omega)[response.cart - 1]))
         line -= 2 * np.pi * np.round(line[0] / (2 * np.pi))
-        (drawn,) = ax.plot(omega, np.degrees(line), color=MODEL)
-        attach_data(drawn, omega, np.degrees(line), name="fit")
+        ax.plot(omega, np.degrees(line), color=MODEL)
         near = np.interp(response.omega, omega, line)
         phase = near + (phase - near + np.pi) % (2 * np.pi) - np.pi
     error = (
@@ -178,8 +174,7 @@ def _points(
         x, at = response.omega[shown], y[shown]
         label = name if in_legend else None
         look = {"ms": 3.2, "mew": 0.8, "mfc": "white", "color": color, "zorder": 3}
-        (drawn,) = ax.plot(x, at, "D", label=label, **look)
-        attach_data(drawn, x, at, name=name)
+        ax.plot(x, at, "D", label=label, **look)
         if error is not None and clear:
             below, above = np.broadcast_to(error, (2, y.size))[:, shown]
             ends = np.column_stack([at - below, at + above, np.full(x.size, np.nan)])
@@ -211,7 +206,7 @@ def _mark_modes(ax: Axes, omega: Array, chain: Chain) -> None:
             ax.axvline(mode, color=QUIET, lw=0.8, ls=":")
             ax.annotate(
                 letter, (mode, 0.0), xycoords=("data", "axes fraction"), xytext=(2, 2),
-                textcoords="offset points", color="#555555", fontsize=7.5, gid="mark",
+                textcoords="offset points", color="#555555", fontsize=7.5,
             )  # fmt: skip
 
 

@@ -9,9 +9,10 @@ from matplotlib.figure import Figure
 from pipeline.arrays import Array
 from pipeline.gap.residual import ResidualForce
 from pipeline.gap.types import FoundEffect, Prediction, RecordGap, Residual, Trace
-from pipeline.report.figures.colours import MEASURED, MODEL, QUIET, SECOND, SECOND_LINE, SHADE
+from pipeline.report.figures import MEASURED, MODEL, QUIET, SECOND, SECOND_LINE, SHADE
 from pipeline.report.figures.style import (
     legend_above,
+    log_scale,
     name_rows,
     panels,
     plot_measured,
@@ -64,7 +65,7 @@ def before_after_figure(
     legend_above(above)
     if band_shows(trace, noise=noise, added=added):
         below.axhspan(-2 * noise, 2 * noise, color=SHADE, lw=0)
-    plot_residuals(below, trace.t, {name: trace.measured - y for name, y in models.items()})
+    plot_residuals(below, trace.t, *(trace.measured - y for y in models.values()))
     below.set_ylabel(f"residual [{position_unit}]")
     below.set_xlabel("time [s]")
     return figure
@@ -93,7 +94,7 @@ def predicted_figure(
     plot_second(above, prediction.t, second, label=other)
     above.set_ylabel(position_label(prediction.cart, position_unit))
     legend_above(above)
-    plot_residuals(below, prediction.t, {"difference": second - first})
+    plot_residuals(below, prediction.t, second - first)
     below.set_ylabel(f"difference [{position_unit}]")
     below.set_xlabel("time [s]")
     return figure
@@ -126,7 +127,7 @@ def plot_by_record(ax: Axes, rows: Sequence[RecordGap], *, added: str = ADDED) -
         100 * np.array([getattr(row, name) for row in rows])
         for name in ("baseline", "final", "noise_floor")
     )
-    ax.set_xscale("log")
+    log_scale(ax, "x")
     if added:
         ax.hlines(y, after, before, color=QUIET, lw=1.4)
         ax.plot(before, y, "o", ms=4.5, mfc="white", mec=SECOND, mew=1.1, label="linear model")
@@ -279,7 +280,7 @@ def spectrum_figure(traces: Sequence[Trace], *, position_unit: str, added: str =
     step = max(1, int(np.count_nonzero(shown) / 600))
     index = np.flatnonzero(shown)[::step]
     figure, (ax,) = panels(1.9)
-    ax.set_yscale("log")
+    log_scale(ax, "y")
     ax.plot(f[index], motion[index], color=MEASURED, lw=0.8, ls=":", label="measured motion")
     ax.plot(f[index], before[index], label="residual, linear model", **SECOND_LINE)
     ax.plot(f[index], after[index], color=MODEL, lw=1.0, label=f"residual, {added}")

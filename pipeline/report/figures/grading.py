@@ -9,10 +9,9 @@ from matplotlib.ticker import MaxNLocator
 
 from pipeline.arrays import Array
 from pipeline.plant.chain import Chain
+from pipeline.report.figures import MEASURED, MODEL, SECOND, SECOND_LINE, SHADE, THIRD
 from pipeline.report.figures.bode import bode_panels
-from pipeline.report.figures.colours import MEASURED, MODEL, SECOND, SECOND_LINE, SHADE, THIRD
 from pipeline.report.figures.style import legend_above, panels, plot_line, shorten
-from pipeline.report.figures.svg import attach_data
 from pipeline.report.figures.time import decay_figure, step_figure
 from pipeline.results import FrequencyResponse, LogDecrement, Record, StepGain
 from pipeline.setup import Units
@@ -25,9 +24,6 @@ def distribution_figure(points: Sequence[float], *, out_of: float) -> Figure:
     centres = (edges[:-1] + edges[1:]) / 2
     figure, (ax,) = panels(1.5)
     ax.bar(centres, counts, width=0.94 * np.diff(edges), color=MODEL)
-    # Invisible points that show values when a reader points at a bar.
-    (tops,) = ax.plot(centres, counts, ls="none", marker="none")
-    attach_data(tops, centres, counts.astype(float), name="submissions")
     ax.set_xlim(0.0, out_of)
     ax.set_ylim(0.0, 1.08 * max(1, counts.max()))
     ax.yaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
@@ -160,7 +156,7 @@ def reported_decay_figure(
         swing = np.exp(-zeta * since) * np.cos(np.sqrt(1 - zeta**2) * since)
         y = rest + (decay.peak_y[0] - rest) * swing
         look = SECOND_LINE | {"color": THIRD}
-        plot_line(ax, t - decay.release, y, look, name="your numbers")
+        plot_line(ax, t - decay.release, y, look, label="your numbers")
     return _titled(figure, ax, title)
 
 

@@ -1,26 +1,30 @@
-"""The style of all figures.
+"""The style of all figures, and their SVG.
 
 Measured data are dark points, and single values are diamonds. Models are blue lines. So figures are
 clear in greyscale and for colour-blind readers. Text can be searched and selected.
 """
 
+import io
+import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from html import escape
 from itertools import takewhile
 from math import fsum
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
+from matplotlib.ticker import LogLocator, NullLocator
 
 from pipeline.arrays import Array
-from pipeline.report.figures.colours import MEASURED, MODEL, QUIET, SECOND_LINE, Look
-from pipeline.report.figures.svg import attach_data
+from pipeline.report.figures import GRID, MEASURED, MODEL, QUIET, SECOND_LINE, Look
 from pipeline.words.numbers import subscript
 from pipeline.words.text import clean
 
@@ -37,12 +41,27 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "axes.linewidth": 0.7,
     "axes.edgecolor": "#444444",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "grid.color": GRID,
+    "grid.linewidth": 0.5,
+    "xtick.bottom": False,
+    "ytick.left": False,
+    "xtick.major.size": 0.0,
+    "ytick.major.size": 0.0,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
     "lines.linewidth": 1.2,
     "text.parse_math": False,  # a dollar sign in a student's text does not begin a formula
     "svg.fonttype": "none",
     "figure.facecolor": "none",
     "savefig.facecolor": "none",
 }
+
+# Ids that matplotlib gives to groups. Nothing refers to them, and they would repeat on a page with
+# several figures.
+_GROUP_ID = re.compile(r' id="[a-zA-Z0-9.]+_\d+"')
 
 
 @contextmanager
@@ -106,6 +125,10 @@ def panels(
             # labels.
             ax.yaxis.set_label_coords((0.16 - left) / width, 0.5)
             ax.xaxis.set_label_coords(0.5, -0.31 / heights[row])
+            ax.tick_params(
+                labelbottom=not share_x or row == len(heights) - 1,
+                labelleft=not share_y or column == 0,
+            )
             axes.append(ax)
     return figure, axes
 
@@ -119,6 +142,8 @@ def small_multiples(
     figure, axes = panels(*[height] * rows, columns=columns, share_y=share_y, titled=True)
     for spare in axes[len(titles) :]:
         figure.delaxes(spare)
+    for lowest in axes[: len(titles)][-columns:]:
+        lowest.tick_params(labelbottom=True)
     # The titles in one row have room for 60 characters in total.
     for ax, title in zip(axes, _short(titles, most=60 // columns), strict=False):
         ax.set_title(title, loc="left", y=1.0)
@@ -161,9 +186,28 @@ def name_rows(ax: Axes, rows: Sequence[tuple[str, str]]) -> None:
     ax.set_position((0.36, box.y0, box.x1 - 0.36, box.height))
 
 
+class _LogTicks(LogLocator):
+    """Powers of ten, with 2 and 5 between them if there is room, and more within one decade."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        between = (2.0, 5.0) if vmax > 7 * vmin else (1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
+        self.set_params(subs=(1.0,) if vmax > 200 * vmin else (1.0, *between))
+        return super().tick_values(vmin, vmax)
+
+
+def log_scale(ax: Axes, *directions: Literal["x", "y"]) -> None:
+    """Make axes logarithmic, with round numbers as labels."""
+    for direction in directions:
+        ax.set(**{f"{direction}scale": "log"})
+        axis = ax.xaxis if direction == "x" else ax.yaxis
+        axis.set_major_locator(_LogTicks())
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_locator(NullLocator())
+
+
 def log_frequency_axis(ax: Axes, omega: Array) -> None:
     """Make x a logarithmic frequency axis with the range of the measured points."""
-    ax.set_xscale("log")
+    log_scale(ax, "x")
     ax.set_xlim(0.9 * float(omega.min()), 1.1 * float(omega.max()))
 
 
@@ -215,15 +259,7 @@ def plot_measured(ax: Axes, t: Array, y: Array, *, most: int = 200) -> None:
     ax.plot([], [], ".", color=MEASURED, ms=3 * 2.2, mew=0, label="measured")
 
 
-def plot_points(
-    ax: Axes,
-    t: Array,
-    y: Array,
-    *,
-    most: int = 200,
-    name: str = "measured",
-    color: str = MEASURED,
-) -> None:
+def plot_points(ax: Axes, t: Array, y: Array, *, most: int = 200, color: str = MEASURED) -> None:
     """Draw a time series as points, at most `most` of them, evenly spread.
 
     More points would hide the model's line. The points are drawn below the thinner line of the
@@ -238,41 +274,32 @@ def plot_points(
     strokes[1::2, 0] += 1e-4 * (points[-1, 0] - points[0, 0])
     path = Path(strokes, np.tile([Path.MOVETO, Path.LINETO], shown.size))
     dots = PathPatch(path, fill=False, color=color, lw=2.2, capstyle="round", zorder=1.9)
-    attach_data(dots, t, y, name=name)
     ax.add_artist(dots)
     ax.update_datalim(points)
     ax.autoscale_view()  # A patch does not do this by itself, and it may be the only artist.
 
 
-def plot_line(
-    ax: Axes, t: Array, y: Array, look: Look, *, name: str, in_legend: bool = True
-) -> None:
-    """Draw a line, thinned to what the eye can see; zooming in shows every sample."""
-    (line,) = ax.plot(*thin(t, y), label=name if in_legend else None, **look)
-    attach_data(line, t, y, name=name)
+def plot_line(ax: Axes, t: Array, y: Array, look: Look, *, label: str | None = None) -> None:
+    """Draw a line, thinned to what the eye can see; with a label, it is in the legend."""
+    ax.plot(*thin(t, y), label=label, **look)
 
 
 def plot_model(ax: Axes, t: Array, y: Array, *, label: str = "model") -> None:
     """Draw a model as a line."""
-    plot_line(ax, t, y, {"color": MODEL, "lw": 1.0}, name=label)
+    plot_line(ax, t, y, {"color": MODEL, "lw": 1.0}, label=label)
 
 
 def plot_second(ax: Axes, t: Array, y: Array, *, label: str) -> None:
     """Draw the model with which the main model is compared, for example the one without effects."""
-    plot_line(ax, t, y, SECOND_LINE, name=label)
+    plot_line(ax, t, y, SECOND_LINE, label=label)
 
 
-def plot_residuals(ax: Axes, t: Array, residuals: Mapping[str, Array]) -> None:
-    """Draw the residuals of one or two models, in the colours of these models.
-
-    Parameters
-    ----------
-    residuals : the residuals of each model, by the model's name.
-    """
+def plot_residuals(ax: Axes, t: Array, *residuals: Array) -> None:
+    """Draw the residuals of one or two models, in the colours of these models."""
     ax.axhline(0.0, color=QUIET, lw=0.6)
     looks = ({"color": MODEL, "lw": 0.8}, SECOND_LINE | {"lw": 0.8})
-    for (name, y), look in zip(residuals.items(), looks, strict=False):
-        plot_line(ax, t, y, look, name=name, in_legend=False)
+    for y, look in zip(residuals, looks, strict=False):
+        plot_line(ax, t, y, look)
 
 
 def keep_in_sight(ax: Axes, measured: Array) -> None:
@@ -289,3 +316,18 @@ def keep_in_sight(ax: Axes, measured: Array) -> None:
 def position_label(cart: int, unit: str) -> str:
     """Return the title of a position axis: "x₁ [cm]"."""
     return f"x{subscript(cart)} [{unit}]"
+
+
+def to_svg(figure: Figure, *, name: str, alt: str) -> str:
+    """Return the figure as an SVG element with a text alternative; the bytes are reproducible.
+
+    The canvas is called directly, because `savefig` would draw everything twice.
+    """
+    buffer = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": name}):
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+    svg = "<svg " + buffer.getvalue().partition("<svg ")[2]
+    svg = re.sub(r"\s*<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = _GROUP_ID.sub("", svg).replace("'DejaVu Sans'", "'DejaVu Sans', sans-serif")
+    title = f"<title>{escape(alt, quote=False)}</title>"
+    return svg.replace("<svg ", '<svg role="img" ', 1).replace(">", f">{title}", 1)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.arrays import Array
-from pipeline.report.figures.colours import CARTS, MEASURED, MODEL, QUIET, SECOND_LINE, SHADE, THIRD
+from pipeline.report.figures import CARTS, MEASURED, MODEL, QUIET, SECOND_LINE, SHADE, THIRD
 from pipeline.report.figures.style import (
     keep_in_sight,
     legend_above,
@@ -22,7 +22,6 @@ from pipeline.report.figures.style import (
     position_label,
     small_multiples,
 )
-from pipeline.report.figures.svg import attach_data
 from pipeline.results import (
     FeedbackDesign,
     HardwareCheck,
@@ -33,7 +32,6 @@ from pipeline.results import (
 )
 from pipeline.setup import Units
 from pipeline.words.numbers import subscript
-from pipeline.words.text import clean
 
 _CYCLES_SHOWN = 10  # cycles shown of the steady part; few enough to tell them apart
 _LOOPS = {"closed": "loop model", "open": "model on measured input"}
@@ -65,9 +63,8 @@ def plot_decay(ax: Axes, decay: LogDecrement, *, record: Record) -> None:
     shown = (t >= min(fit_t[0], 0.0) - 0.15 * length) & (t <= fit_t[-1] + 0.25 * length)
     t, y = t[shown], record.position(decay.cart)[shown]
     plot_measured(ax, t, y)
-    for envelope, label in ((decay.envelope_upper, "envelope"), (decay.envelope_lower, "")):
-        plot_line(ax, fit_t, envelope, SECOND_LINE | {"lw": 0.9},
-                  name=label or "envelope below", in_legend=bool(label))  # fmt: skip
+    for envelope, label in ((decay.envelope_upper, "envelope"), (decay.envelope_lower, None)):
+        plot_line(ax, fit_t, envelope, SECOND_LINE | {"lw": 0.9}, label=label)
     plot_model(ax, fit_t, decay.fit_y, label="fit")
     ax.plot(decay.peak_t - zero, decay.peak_y, "D", ms=3.0, mfc="none", mec=MEASURED, mew=0.8,
             label="extrema used")  # fmt: skip
@@ -95,9 +92,8 @@ def damping_figure(decays: Sequence[LogDecrement], *, position_unit: str) -> Fig
 def plot_damping(ax: Axes, decay: LogDecrement, *, marker: str) -> None:
     """Plot the local damping ratio over the amplitude at which it was measured."""
     amplitude, zeta = decay.zeta_at_amplitude
-    (line,) = ax.plot(amplitude, zeta, marker, ms=3.2, mfc="white", mec=MEASURED, mew=0.8, ls="-",
-                      lw=0.6, color=QUIET)  # fmt: skip
-    attach_data(line, amplitude, zeta, name=clean(decay.name))
+    ax.plot(amplitude, zeta, marker, ms=3.2, mfc="white", mec=MEASURED, mew=0.8, ls="-", lw=0.6,
+            color=QUIET)  # fmt: skip
 
 
 # ---------------------------------------------------------------------- steps
@@ -149,7 +145,7 @@ def _plot_cart_points(ax: Axes, t: Array, y: Array, *, cart: int) -> None:
     """
     style, name = (cart - 1) % len(CARTS), f"x{subscript(cart)}"
     colour, _, mark, _ = CARTS[style]
-    plot_points(ax, t, y, most=400, name=name, color=colour)
+    plot_points(ax, t, y, most=400, color=colour)
     # Each cart has 16 markers at times of its own, so that equal motions do not hide each other.
     at = np.linspace(0, t.size - 1, 16 * len(CARTS)).astype(int)[style :: len(CARTS)]
     ax.plot(t[at], y[at], mark, ms=3.6, mfc="white", mec=colour, mew=0.9, label=name)
@@ -158,7 +154,7 @@ def _plot_cart_points(ax: Axes, t: Array, y: Array, *, cart: int) -> None:
 def _plot_cart(ax: Axes, t: Array, y: Array, *, cart: int, lw: float = 1.0) -> None:
     """Plot a cart's line, in its own style, in a panel that it shares with other carts."""
     colour, ls, *_ = CARTS[(cart - 1) % len(CARTS)]
-    plot_line(ax, t, y, {"color": colour, "ls": ls, "lw": lw}, name=f"x{subscript(cart)}")
+    plot_line(ax, t, y, {"color": colour, "ls": ls, "lw": lw}, label=f"x{subscript(cart)}")
 
 
 # ---------------------------------------------------------------------- sines
@@ -186,7 +182,7 @@ def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
     shown = record.t <= end
     t, y = record.t[shown], record.position(point.cart)[shown]
     steady = t >= point.steady_from
-    plot_line(ax, t, y, {"color": QUIET, "lw": 0.7}, name="record", in_legend=False)
+    plot_line(ax, t, y, {"color": QUIET, "lw": 0.7})
     plot_measured(ax, t, y, most=300)
     ax.axvspan(float(t[0]), point.steady_from, color=SHADE, lw=0, label="transient")
     # Over ten cycles, the mean of the samples is close enough to the middle of the oscillation.
@@ -220,8 +216,7 @@ def hardware_figure(
             axes[0].plot([], [], color=THIRD, lw=0.9, ls="-.", label="set point")
         plot_hardware(above, group)
         above.set_ylabel(position_label(group[0].cart, units.position))
-        residuals = {_LOOPS[check.loop]: check.measured - check.model for check in group}
-        plot_residuals(below, group[0].t, residuals)
+        plot_residuals(below, group[0].t, *(check.measured - check.model for check in group))
         keep_in_sight(below, group[0].measured - np.median(group[0].measured))
         below.set_ylabel(f"residual [{units.position}]")
     if driven:
@@ -237,8 +232,7 @@ def plot_effort(ax: Axes, record: Record, *, model: Array | None) -> None:
     assert record.u is not None
     plot_points(ax, record.t, record.u)
     if model is not None:
-        look = {"color": MODEL, "lw": 1.0}
-        plot_line(ax, record.t, model, look, name="loop model", in_legend=False)
+        plot_line(ax, record.t, model, {"color": MODEL, "lw": 1.0})
         keep_in_sight(ax, record.u)
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.arrays import Array
-from pipeline.report.figures.svg import packed_time
 from pipeline.report.plots.runs import ComparedCart, ComparedRun
 from pipeline.report.plots.spectrum import amplitude_spectrum, thin_lines
 from pipeline.words.text import clean
@@ -36,7 +35,7 @@ def pack_run(run: ComparedRun) -> dict[str, Any]:
         "id": clean(run.id),
         "kind": run.kind,
         "note": clean(run.note),
-        "t": packed_time(run.t[kept]),
+        "t": pack_time(run.t[kept]),
         "u": None if run.u is None else pack(run.u[kept]),
         "omega": pack(omega),
         "carts": [
@@ -85,6 +84,16 @@ def pack(values: Array) -> list[Any]:
     levels = np.round((shown - middle) / step) if step > 0.0 else np.zeros(values.size)
     levels = np.where(np.isfinite(values), np.clip(levels, -32767, 32767), -32768)
     return [middle, step, b64encode(levels.astype("<i2").tobytes()).decode()]
+
+
+def pack_time(values: Array) -> str:
+    """Return times as "first last" if they are evenly spaced, else as base64 of float32."""
+    if values.size > 1:
+        even = np.linspace(values[0], values[-1], values.size)
+        # A sample that deviates by less than this share of the span still looks evenly spaced.
+        if np.max(np.abs(values - even)) <= 1e-5 * abs(even[-1] - even[0]):
+            return f"{float(values[0]):.9g} {float(values[-1]):.9g}"
+    return b64encode(values.astype("<f4").tobytes()).decode()
 
 
 def _spectra(run: ComparedRun) -> tuple[Array, Any]:

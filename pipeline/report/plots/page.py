@@ -5,7 +5,6 @@ Without scripts, readers see the picture and the table of errors.
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlencode
 
@@ -27,7 +26,6 @@ from pipeline.report.figures.style import (
     plot_second,
     position_label,
 )
-from pipeline.report.figures.svg import plain_svg
 from pipeline.report.gap.verdict import added_name, share
 from pipeline.report.plots import NAME
 from pipeline.report.plots.pack import MOST_WHOLE, pack_run
@@ -162,8 +160,7 @@ def _draw_still(page: Page, runs: Sequence[ComparedRun], *, added: str) -> Pictu
         return None
     with drawing():
         figure = _still_figure(chosen[0], position_unit=page.position, added=added)
-        picture = page.picture("compare", figure, _WORDS, "still", run=chosen[0].id)
-    return replace(picture, draw=lambda: plain_svg(picture.svg))
+        return page.picture("compare", figure, _WORDS, "still", run=chosen[0].id)
 
 
 def _still_figure(run: ComparedRun, *, position_unit: str, added: str) -> Figure:

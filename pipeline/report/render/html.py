@@ -10,13 +10,12 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import combinations
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from pipeline.report.document import Block, Document, Picture, Table, Tiles, flat
-from pipeline.report.figures.colours import GRID, MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
+from pipeline.report.figures import GRID, MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
 from pipeline.resources import TEMPLATES
 from pipeline.words.math import Term, to_mathml
 from pipeline.words.numbers import unbroken
@@ -27,8 +26,7 @@ _ROLES = {
     MEASURED: "ink", MODEL: "model", SECOND: "second", THIRD: "third", QUIET: "quiet",
     SHADE: "shade", GRID: "grid", "#444444": "axis", "#555555": "mark",
 }  # fmt: skip
-ALWAYS, EXPLORE, FINDER = "page.js", "explore.js", "finder.js"
-_SOMETIMES = (EXPLORE, FINDER)
+ALWAYS, FINDER = "page.js", "finder.js"
 PLOTS = ("uplot.min.js", "charts.js", "plots.js")  # scripts that only the page of plots has
 _TITLE = re.compile(r"<title>.*?</title>", re.DOTALL)
 _NARROW = " .,()"  # characters that are half as wide as a digit
@@ -96,21 +94,15 @@ def script_hash(text: str) -> str:
 
 def every_hash() -> Iterable[str]:
     """Return the hashes of all scripts that a page may have."""
-    for n in range(len(_SOMETIMES) + 1):
-        for names in combinations(_SOMETIMES, n):
-            yield script_hash(script(ALWAYS, *names))
-    yield script_hash(script(*PLOTS))
+    for names in ((ALWAYS,), (ALWAYS, FINDER), PLOTS):
+        yield script_hash(script(*names))
 
 
 def _scripts(document: Document) -> list[str]:
     """Return the scripts that a document needs."""
     blocks = [block for section in document.sections for block in flat(section.blocks)]
-    names = [ALWAYS]
-    if any(isinstance(block, Picture) for block in blocks):
-        names.append(EXPLORE)
-    if any(isinstance(block, Table) and block.finder for block in blocks):
-        names.append(FINDER)
-    return names
+    finder = any(isinstance(block, Table) and block.finder for block in blocks)
+    return [ALWAYS, FINDER] if finder else [ALWAYS]
 
 
 @cache

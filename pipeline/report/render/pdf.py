@@ -10,7 +10,6 @@ from matplotlib import get_data_path
 from matplotlib.ft2font import FT2Font
 
 from pipeline.report.document import Document, as_json
-from pipeline.report.figures.svg import plain_svg
 from pipeline.resources import TEMPLATES
 from pipeline.words.numbers import unbroken
 from pipeline.words.text import clean
@@ -23,9 +22,7 @@ _SHOWN_IN_WARNING = 20
 def render_pdf(document: Document) -> bytes:
     """Return the PDF (archival A-2a, accessible UA-1), which uses only the fonts of cartlab."""
     text = json.dumps(_printable(as_json(document)), ensure_ascii=False, allow_nan=False)
-    figures = {
-        f"{one.number}.svg": _printable(plain_svg(one.svg)).encode() for one in document.pictures()
-    }
+    figures = {f"{one.number}.svg": _printable(one.svg).encode() for one in document.pictures()}
     parts: Any = {
         "main.typ": (TEMPLATES / "report.typ").read_bytes(),
         "document.json": text.encode(),

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from pipeline.report.document import Document
-from pipeline.report.figures.svg import plain_svg
 from pipeline.report.render.folder import FIGURES, Made, write_files
 from pipeline.report.render.html import render_html
 from pipeline.report.render.pdf import render_pdf
@@ -11,7 +10,7 @@ from pipeline.report.render.pdf import render_pdf
 
 def make_files(document: Document, *, name: str, pdf: bool) -> Made:
     """Return `figures/*.svg`, `name.html` and, if asked for, `name.pdf`."""
-    drawn = {f"{FIGURES}/{one.name}.svg": plain_svg(one.svg) for one in document.pictures()}
+    drawn = {f"{FIGURES}/{one.name}.svg": one.svg for one in document.pictures()}
     printed = {f"{name}.pdf": render_pdf(document)} if pdf else {}
     return {**drawn, f"{name}.html": render_html(document), **printed}
 

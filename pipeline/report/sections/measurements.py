@@ -6,8 +6,8 @@ from pipeline.identify.model_checks import name_law
 from pipeline.names import mode_suffixes, omega_names
 from pipeline.report.builder import Page, left_out
 from pipeline.report.document import Block, Details, Table, cell, paragraph
+from pipeline.report.figures import CARTS
 from pipeline.report.figures.bode import bode_figure, overview_figure
-from pipeline.report.figures.colours import CARTS
 from pipeline.report.figures.time import damping_figure, decay_figure, sine_figure, step_figure
 from pipeline.results import FrequencyResponse
 from pipeline.words.numbers import count, listing, percent, significant, with_error

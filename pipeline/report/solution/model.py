@@ -18,7 +18,7 @@ from pipeline.report.equations.algebra import (
     work_out,
 )
 from pipeline.report.equations.model import formula, symbolic_transfer_functions
-from pipeline.report.figures.colours import MEASURED, MODEL, QUIET
+from pipeline.report.figures import MEASURED, MODEL, QUIET
 from pipeline.report.figures.style import WIDTH
 from pipeline.report.sections.parameters import chain_table
 from pipeline.words.math import Math, Term, lines, matrix, row, total

@@ -13,7 +13,6 @@ import numpy as np
 
 _DIGITS = 8
 _LABEL = 14  # characters of a label
-_TICKS = ("grid-x", "grid-y", "tick-x", "tick-y", "mark")  # drawn by cartlab, but no data
 
 
 def summary(values: Any) -> list[float]:
@@ -49,8 +48,6 @@ def read_back(figure: Any) -> dict[str, Any]:
 
 
 def _drawn(artist: Any) -> dict[str, Any]:
-    if artist.get_gid() in _TICKS:
-        return {}
     if hasattr(artist, "get_xdata"):
         x, y = summary(artist.get_xdata()), summary(artist.get_ydata())
         return {"x": x, "y": y} if x else {}
