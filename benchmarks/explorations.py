@@ -28,7 +28,7 @@ from pipeline.experiments.information import ErrorGoal
 from pipeline.experiments.plan import session_time
 from pipeline.experiments.propose import extend_plan, propose_plan
 from pipeline.plant.catalogue import find_effect
-from pipeline.report.exploration.diary import write_diary
+from pipeline.report.exploration import write_diary
 from pipeline.submission import load_submission
 from tests.helpers.virtual import LimitPassed, VirtualBench, VirtualSession
 

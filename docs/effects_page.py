@@ -9,8 +9,8 @@ from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import Effect
 from pipeline.report.builder import PageBuilder
-from pipeline.report.effects.catalogue import parameter_text
-from pipeline.report.effects.gallery import BENCH, effect_picture, hiding_option
+from pipeline.report.effect_texts import parameter_text
+from pipeline.report.effects import BENCH, effect_picture, hiding_option
 from pipeline.report.figures.style import drawing
 from pipeline.simulated.hidden import usual_term
 from pipeline.words.math import to_tex

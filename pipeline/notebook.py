@@ -17,7 +17,7 @@ from pipeline.plant.margins import closed_loop
 from pipeline.plant.motion import EquationsOfMotion
 from pipeline.report import gap_tables, tables
 from pipeline.report.document import Block, Document, Heading
-from pipeline.report.gap.load_gap import with_gap
+from pipeline.report.gap.gap_files import with_gap
 from pipeline.report.gap.verdict import terminal_verdict
 from pipeline.report.lab_report.content import build_document
 from pipeline.report.render.html import render_fragment

@@ -36,8 +36,7 @@ def explore(
     """Record, identify, analyse the gap and choose the next recording, until the goal is met."""
     from pipeline.bench.explore import explore_bench
     from pipeline.experiments.information import read_error_goal, read_time
-    from pipeline.report.exploration import NAME
-    from pipeline.report.exploration.diary import write_diary
+    from pipeline.report.exploration import NAME, write_diary
 
     goal, seconds = read_error_goal(until), read_time(limit)
     if ask and not sys.stdin.isatty():

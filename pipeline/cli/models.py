@@ -47,12 +47,12 @@ def effects(
 ) -> None:
     """List the effects beyond the linear chain: law, fingerprint, deciding experiment."""
     from pipeline.plant.catalogue import CATALOGUE, find_effect
-    from pipeline.report.effects.catalogue import catalogue_data, catalogue_text
+    from pipeline.report.effect_texts import catalogue_data, catalogue_text
 
     chosen = [find_effect(name)] if name else CATALOGUE
     if out:
         from pipeline.output import named_folder
-        from pipeline.report.effects.gallery import render_effects
+        from pipeline.report.effects import render_effects
 
         with progress_line() as progress:
             render_effects(chosen, named_folder(out), progress=progress)

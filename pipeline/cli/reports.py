@@ -16,7 +16,7 @@ from pipeline.words.progress import Progress
 
 if TYPE_CHECKING:
     from pipeline.report.lab_report.changes import DraftChanges
-    from pipeline.report.lab_report.files import Files
+    from pipeline.report.lab_report.write import Files
     from pipeline.results import Analysis
     from pipeline.submission import Submission
 
@@ -144,7 +144,7 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Identify the carts, design the controller, check the hardware, write the report."""
-    from pipeline.report.lab_report.files import Files
+    from pipeline.report.lab_report.write import Files
 
     files = Files(pdf=pdf, tables=tables, plots=plots)
     analysis = run_report(folder, out=out, files=files, compare=compare)
@@ -341,9 +341,9 @@ def explain(
         # These imports load the compiled simulator.
         from pipeline.experiments.discriminate import propose_for
         from pipeline.gap.explain import investigate
+        from pipeline.report.gap.gap_files import clear_model, save_model
         from pipeline.report.gap.verdict import terminal_verdict
-        from pipeline.report.model_files import clear_model, save_model
-        from pipeline.report.render.folder import write_files
+        from pipeline.report.render.write import write_files
 
         found = investigate(analysis, budget=budget, progress=progress)
         progress("choosing the next recording")

@@ -44,7 +44,7 @@ def check_exercise(
 def draw_effect(bench: Mapping[str, str], hide: str, *, progress: Progress) -> str:
     """Return a picture that compares a run with an effect and a run without it."""
     from pipeline.report.builder import PageBuilder
-    from pipeline.report.effects.gallery import effect_picture
+    from pipeline.report.effects import effect_picture
     from pipeline.report.figures.style import drawing
 
     hidden = _prepare(bench, [hide])

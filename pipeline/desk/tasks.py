@@ -109,9 +109,9 @@ def make_gap(folder: str, *, progress: Progress) -> None:
     from pipeline.experiments.discriminate import propose_for
     from pipeline.gap.explain import investigate
     from pipeline.json_files import json_text
+    from pipeline.report.gap.gap_files import clear_model
     from pipeline.report.gap.gap_report import make_gap_files
-    from pipeline.report.model_files import clear_model
-    from pipeline.report.render.folder import write_files
+    from pipeline.report.render.write import write_files
     from pipeline.workflow import analyse
 
     submission = load_submission(Path(folder))
@@ -128,7 +128,7 @@ def make_gap(folder: str, *, progress: Progress) -> None:
 
 def make_plots(folder: str, *, progress: Progress) -> None:
     """Write the page of plots into the submission's folder, next to its report."""
-    from pipeline.report.gap.load_gap import with_gap
+    from pipeline.report.gap.gap_files import with_gap
     from pipeline.report.plots.page import write_plots
     from pipeline.workflow import analyse
 

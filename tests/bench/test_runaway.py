@@ -12,7 +12,7 @@ from pipeline.errors import HardwareError
 from pipeline.experiments.information import ErrorGoal
 from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.protocol import EXTENSIONS, Reading
-from pipeline.report.exploration.diary import write_diary
+from pipeline.report.exploration import write_diary
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import (
     Notes,

@@ -17,7 +17,7 @@ import pytest
 from pipeline.bench.raw import read_raw
 from pipeline.desk.app import DeskServer
 from pipeline.experiments.plan import load_plan
-from pipeline.report.exploration.diary import NAME as DIARY
+from pipeline.report.exploration import NAME as DIARY
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.desks import Visitor, a_recorded_cart, at_desk

@@ -30,7 +30,7 @@ from pipeline.experiments.plan import (
     time_words,
 )
 from pipeline.experiments.propose import add_recording, propose_plan
-from pipeline.report.exploration.diary import NAME, write_diary
+from pipeline.report.exploration import NAME, write_diary
 from pipeline.results import Analysis
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission

@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SubmissionError
-from pipeline.report.sections.answers import with_answer, written_answer
-from pipeline.report.sections.notes import discussion_blocks
+from pipeline.report.sections.notes import discussion_blocks, with_answer, written_answer
 from pipeline.report.sections.questions import Asked, split_notes
 
 NOTES = """\

@@ -6,8 +6,8 @@ import re
 import pytest
 
 from pipeline.plant.catalogue import CATALOGUE, find_effect
-from pipeline.report.effects.catalogue import catalogue_data, catalogue_text
-from pipeline.report.effects.gallery import build_gallery, render_effects
+from pipeline.report.effect_texts import catalogue_data, catalogue_text
+from pipeline.report.effects import build_gallery, render_effects
 from tests.helpers.commandline import cartlab_here
 
 

@@ -10,7 +10,7 @@ from pipeline.experiments.exploration import Turn, WeighedExplanation, deciding_
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, EffectTerm
-from pipeline.report.exploration.diary import write_diary
+from pipeline.report.exploration import write_diary
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.gaps import make_gap, two_cart_analysis
 

@@ -13,10 +13,18 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.arrays import Array
-from pipeline.report.plots.pack import keep_extremes, pack, pack_run
-from pipeline.report.plots.page import NAME, render_page, write_plots
+from pipeline.report.plots.page import (
+    MOST_LINES,
+    NAME,
+    amplitude_spectrum,
+    keep_extremes,
+    pack,
+    pack_run,
+    render_page,
+    thin_lines,
+    write_plots,
+)
 from pipeline.report.plots.runs import ComparedCart, ComparedRun, compare_runs
-from pipeline.report.plots.spectrum import MOST_LINES, amplitude_spectrum, thin_lines
 from pipeline.results import Analysis
 from pipeline.words.progress import silent
 from tests.helpers.analysis_factory import make_analysis

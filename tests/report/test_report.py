@@ -27,8 +27,7 @@ from pipeline.report.document import (
     make_table,
 )
 from pipeline.report.lab_report.content import build_document, make_draft
-from pipeline.report.lab_report.files import Files
-from pipeline.report.lab_report.write import write_draft
+from pipeline.report.lab_report.write import Files, write_draft
 from pipeline.report.render.html import render_blocks, render_html
 from pipeline.report.render.pdf import missing_characters, render_pdf
 from pipeline.report.sections.housekeeping import file_table, provenance_blocks

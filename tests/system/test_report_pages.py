@@ -12,11 +12,11 @@ import html5lib
 import pytest
 
 from pipeline.plant.catalogue import CATALOGUE
-from pipeline.report.effects.gallery import render_effects
+from pipeline.report.effects import render_effects
 from pipeline.report.gap.gap_report import make_gap_files
 from pipeline.report.lab_report.content import make_draft
 from pipeline.report.lab_report.write import write_draft
-from pipeline.report.render.folder import write_files
+from pipeline.report.render.write import write_files
 from pipeline.report.solution.write import render_solution
 from pipeline.results import Analysis
 from pipeline.submission import load_submission

@@ -57,7 +57,7 @@ def _explore(folder: Path, request: dict[str, Any], state: LiveState) -> str:
     """Explore; return a sentence on what is known at the end."""
     from pipeline.bench.explore import explore_bench
     from pipeline.experiments.information import read_error_goal, read_time
-    from pipeline.report.exploration.diary import write_diary
+    from pipeline.report.exploration import write_diary
     from pipeline.words.text import with_symbols
 
     until, limit = request["explore"]

@@ -17,7 +17,7 @@ from pipeline.errors import ConfigError
 from pipeline.output import new_folder
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
-from pipeline.report.effects.catalogue import catalogue_data
+from pipeline.report.effect_texts import catalogue_data
 from pipeline.submission.load import NAME, file_problem
 from pipeline.words.math import to_text
 

@@ -29,7 +29,7 @@ from pipeline.identify.springs import find_springs
 from pipeline.ingest.fill import UNSURE, data_files, experiment_doubts, system_doubts
 from pipeline.lock import lock_when_free
 from pipeline.output import write_file
-from pipeline.report.sections.answers import with_answer, written_answer
+from pipeline.report.sections.notes import with_answer, written_answer
 from pipeline.submission import load_submission
 from pipeline.submission.edit import (
     Stale,

@@ -1,18 +1,26 @@
-"""The model as mathematics: equations of motion, matrices, transfer functions.
+"""The model as mathematics: equations of motion, matrices, transfer functions, effects, controller.
 
 Symbols follow the paper's notation; numbers have four digits.
 """
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from string import ascii_lowercase
+from textwrap import wrap
 
 import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.plant.chain import Chain, quadratic_factors
+from pipeline.plant.effect import EffectTerm, ForceLaw, input_steps
+from pipeline.plant.sampled_loop import VELOCITY_CORRECTION
 from pipeline.report.document import Formula
 from pipeline.report.equations.algebra import shown
 from pipeline.report.equations.derivation import neighbours, of_cart, springs_at
+from pipeline.results import FeedbackDesign
 from pipeline.words.math import (
+    WIDE_SPACE,
     Math,
     Term,
     dot,
@@ -27,11 +35,20 @@ from pipeline.words.math import (
     symbol,
     to_text,
     total,
+    upright,
 )
 from pipeline.words.numbers import significant
 
 _DIGITS = 4
 _ALL_DIGITS = 10  # the same number as in results.json
+
+_LINEAR_PART = ("k", "d", "+")  # start of a spring's law that is already part of the linear chain
+_ACTS = ("f", "=")
+_COMMAND = sub("u", "command")
+_MOTOR_MASS = sub("m", "m")
+
+_LONGEST_LINE = 72  # characters of code in a line of the PDF
+_APART = 1e-3  # relative distance; MATLAB's `place` refuses poles that coincide
 
 
 def formula(math: Math, *, copy: str = "") -> Formula:
@@ -220,3 +237,227 @@ def _polynomial(coefficients: Array) -> Term:
         )
         terms.append(row(*([] if value == 1 and s else [_short(value)]), *s))
     return total(terms)
+
+
+def in_order(terms: Sequence[EffectTerm]) -> list[int]:
+    """Return the indices of the effects in the order in which they get their letters.
+
+    This is the order of `terms`, except that effects on the input follow the simulator's order.
+    """
+    steps = input_steps(terms)
+    after = iter(steps)
+    return [terms.index(next(after) if term in steps else term) for term in terms]
+
+
+def augmented_equations(springs: Sequence[bool], terms: Sequence[EffectTerm]) -> Formula:
+    """Return Newton's law of every cart, in which each effect adds a force.
+
+    The forces are named by the letters a, b, … of the effects. Cart 1 is driven by the input as
+    changed by all effects on the input. If there is play between the motor and cart 1, the force of
+    the contact drives the cart, and the motor's mass is subtracted from the cart's mass.
+    """
+    n = len(springs) - 1
+    letters = _letters(terms)
+    forces: list[list[Term]] = [[] for _ in range(n)]
+    play = _play(terms)
+    if play is None:
+        forces[0] = [_arriving(terms)]
+    else:
+        forces[0] = [sub("f", letters[play]), "+", _MOTOR_MASS, sub(dot("x", order=2), "1")]
+    for index in in_order(terms):
+        term, f = terms[index], sub("f", letters[index])
+        if term.effect.formula.parts[:2] != _ACTS or (play is not None and _on_motor(term)):
+            continue
+        if "spring" in term.where:
+            spring = term.place
+            if spring <= n:
+                forces[spring - 1] += ["−", f]
+            if spring > 1:
+                forces[spring - 2] += ["+", f]
+        else:
+            forces[max(term.place, 1) - 1] += ["+", f]
+    return equations_of_motion(springs, forces=[_sum(parts) for parts in forces])
+
+
+def law(terms: Sequence[EffectTerm], index: int) -> Formula:
+    """Return the law of one effect, marked with the effect's letter.
+
+    Effects on the input form a sequence: each one changes the output of the previous one. A force
+    that depends on the input uses the last output.
+    """
+    term, letter = terms[index], _letters(terms)[index]
+    effect, parts = term.effect, term.effect.formula.parts
+    steps = input_steps(terms)
+    if term in steps:
+        before, after = _arriving(terms, before=term), sub("u", letter)
+        if "→" in parts:
+            at = parts.index("→")
+            changed = _replaced(parts[at + 1 :], {"u": before})
+            return formula(row(after, *parts[1:at], "=", *changed))
+        own = {_COMMAND: before, "u": after, dot("u"): sub(dot("u"), letter)}
+        return formula(row(*_replaced(parts, own)))
+    if effect.has_play:
+        return formula(row(*_across(terms, index)))
+    if parts[:2] != _ACTS:
+        return formula(effect.formula)  # a sensor
+    force = parts[2:]
+    if effect.place == "spring" and force[:3] == _LINEAR_PART:
+        force = force[3:]
+    # A drive is powered while its logged input is not zero.
+    powered = upright(" while ")
+    end = force.index(powered) if powered in force else len(force)
+    symbols: dict[Term, Term] = {"u": _arriving(terms), "f": sub("f", letter)}
+    if _on_motor(term) and _play(terms) is not None:
+        symbols |= {sub(letter, "1"): sub(letter, "m") for letter in "xv"}
+    return formula(row(sub("f", letter), "=", *_replaced(force[:end], symbols), *force[end:]))
+
+
+def _across(terms: Sequence[EffectTerm], index: int) -> list[Term]:
+    """Return the contact force between motor and cart 1, and Newton's law of the motor."""
+    letters = _letters(terms)
+    force = sub("f", letters[index])
+    motor: list[Term] = [_arriving(terms), "−", force]
+    for i in in_order(terms):
+        if _on_motor(terms[i]):
+            motor += ["+", sub("f", letters[i])]
+    contact = _replaced(terms[index].effect.formula.parts, {sub("f", "1"): force})
+    return [*contact, ",", WIDE_SPACE, _MOTOR_MASS, sub(dot("x", order=2), "m"), "=", *motor]
+
+
+def _letters(terms: Sequence[EffectTerm]) -> dict[int, str]:
+    """Return the letter of each effect, by its index."""
+    return dict(zip(in_order(terms), ascii_lowercase, strict=False))
+
+
+def _arriving(terms: Sequence[EffectTerm], *, before: EffectTerm | None = None) -> Term:
+    """Return the symbol of the input after all effects on it, or only those before `before`."""
+    steps = input_steps(terms)
+    done = steps if before is None else steps[: steps.index(before)]
+    return sub("u", _letters(terms)[terms.index(done[-1])]) if done else "u"
+
+
+def _play(terms: Sequence[EffectTerm]) -> int | None:
+    """Return the index of the play between motor and cart 1; None if there is no play."""
+    return next((i for i, term in enumerate(terms) if term.effect.has_play), None)
+
+
+def _on_motor(term: EffectTerm) -> bool:
+    """Return whether the force acts on the motor, rather than on cart 1, if there is play."""
+    return isinstance(term.effect.law, ForceLaw) and term.effect.law.on_motor
+
+
+def _replaced(terms: Sequence[Term], by: Mapping[Term, Term]) -> list[Term]:
+    """Return the terms with symbols replaced, also inside nested terms."""
+    return [
+        by[term]
+        if term in by
+        else replace(term, parts=tuple(_replaced(term.parts, by)))
+        if isinstance(term, Math)
+        else term
+        for term in terms
+    ]
+
+
+def _sum(parts: list[Term]) -> Term:
+    if not parts:
+        return "0"
+    return row(*(parts[1:] if parts[0] == "+" else parts))
+
+
+def controller_equations() -> Formula:
+    """Return how the observer and the gains make the next effort from the readings y.
+
+    q is the state with the readings and the corrected velocities v; p is the state predicted at the
+    last tick, with positions z and velocities w.
+    """
+    share = fraction(str(VELOCITY_CORRECTION), "T")
+    return formula(
+        lines(
+            [
+                row(_at("v"), "=", _at("w"), "+", share, parens(_at("y"), "−", _at("z"))),
+                row(_at("p", 1), "=", "Φ", _at("q"), "+", "Γ", _at("u")),
+                row(_at("u", 1), "=", "prefilter", "·", "r", "−", "G", _at("p", 1)),
+            ]
+        )
+    )
+
+
+def _at(symbol: str, later: int = 0) -> Math:
+    return sub(symbol, row("k", "+", str(later)) if later else "k")
+
+
+def weights_formula(Q: Array) -> Formula:
+    """Return the weights of the state in the cost, which can be copied with all digits."""
+    return formula(row("Q", "=", number_matrix(Q)), copy=matlab_matrix("Q", Q))
+
+
+def matlab_code(chain: Chain, design: FeedbackDesign) -> str:
+    """Return MATLAB commands that compute gains, prefilter and margins from the fitted carts."""
+    n, states = chain.n, 2 * chain.n
+    first = "; ".join("1" if i == 0 else "0" for i in range(n))
+    statements = [
+        "% The carts; the state is (x1, v1, x2, v2, ...)",
+        _diagonal("M", chain.m),
+        _diagonal("C", chain.c),
+        matlab_matrix("K", chain.stiffness),
+        f"A = kron(eye({n}), [0 1; 0 0]);",
+        "A = A - kron(M\\K, [0 0; 1 0]) - kron(M\\C, [0 0; 0 1]);",
+        f"B = kron(M\\[{first}], [0; 1]);",
+        "% Sampled, with the input held from tick to tick",
+        f"T = {_number(design.sample_time)};",
+        f"E = expm(T*[A B; zeros(1, {states + 1})]);",
+        f"Phi = E(1:{states}, 1:{states});",
+        f"Gamma = E(1:{states}, {states + 1});",
+        "% Gains and prefilter",
+        *_gains(design),
+        f"c = zeros(1, {states});",
+        f"c({2 * design.cart - 1}) = 1;",
+        f"prefilter = 1/(c/(eye({states}) - Phi + Gamma*G)*Gamma)",
+        "% Observer: reads the positions, corrects the predicted velocities",
+        f"S = kron(eye({n}), [1 0; {VELOCITY_CORRECTION}/T 0]);",
+        "% Loop from the input of cart 1 to minus the effort;",
+        "% its state is (x, prediction, effort)",
+        f"P = [Phi*S, Phi*(eye({states}) - S), Gamma];",
+        f"F = [Phi, zeros({states}, {states + 1}); P; -G*P];",
+        f"H = [Gamma; zeros({states + 1}, 1)];",
+        f"L = ss(F, H, [zeros(1, {2 * states}) -1], 0, T);",
+        "margins = allmargin(L)",
+        "modulus = 1/norm(feedback(1, L), inf)",
+    ]
+    return "\n".join(_broken(statement) for statement in statements)
+
+
+def _gains(design: FeedbackDesign) -> list[str]:
+    if design.Q is not None and design.R is not None:
+        weights = [matlab_matrix("Q", design.Q), f"R = {_number(design.R)};"]
+        return [*weights, "G = dlqr(Phi, Gamma, Q, R)"]
+    poles = design.poles if design.requested_poles is None else design.requested_poles
+    listed = "; ".join(
+        f"{_number(p.real)}{p.imag:+.10g}i" if p.imag else _number(p.real) for p in poles
+    )
+    others = np.abs(poles[:, None] - poles) + np.diag(np.full(poles.size, np.inf))
+    place = "place" if np.all(others > _APART * np.abs(poles)) else "acker"
+    return [f"poles = [{listed}];", f"G = {place}(Phi, Gamma, exp(T*poles))"]
+
+
+def _diagonal(name: str, values: Array) -> str:
+    return f"{name} = diag([{' '.join(map(_number, values))}]);"
+
+
+def _number(value: float) -> str:
+    return f"{value:.10g}"
+
+
+def _broken(statement: str) -> str:
+    """Return a statement in lines that fit on the page; "..." continues it in MATLAB.
+
+    A matrix breaks between its rows first.
+    """
+    if len(statement) <= _LONGEST_LINE:
+        return statement
+    pieces = [
+        piece
+        for part in re.split(r"(?<=;) +", statement)
+        for piece in wrap(part, _LONGEST_LINE - 8, break_long_words=False, break_on_hyphens=False)
+    ]
+    return " ...\n    ".join(pieces)

@@ -23,7 +23,7 @@ from pipeline.report.document import (
     cell,
     paragraph,
 )
-from pipeline.report.equations.effects import augmented_equations, in_order, law
+from pipeline.report.equations.model import augmented_equations, in_order, law
 from pipeline.report.figures.gap import (
     band_shows,
     before_after_figure,
@@ -59,8 +59,7 @@ from pipeline.report.gap.verdict import (
     verdict_title,
     whole_model,
 )
-from pipeline.report.render.folder import Made
-from pipeline.report.render.write import make_files
+from pipeline.report.render.write import Made, make_files
 from pipeline.report.sections.housekeeping import provenance_blocks
 from pipeline.report.sections.parameters import chain_table
 from pipeline.results import Analysis, Intervention

@@ -15,11 +15,10 @@ from pipeline.report.equations.model import (
     symbolic_transfer_functions,
 )
 from pipeline.report.lab_report.changes import DraftChanges, change_blocks, changes_line
-from pipeline.report.lab_report.files import NAME, PAGE_AND_PDF, Draft, Files
+from pipeline.report.lab_report.write import NAME, PAGE_AND_PDF, Draft, Files
 from pipeline.report.plots import NAME as PLOTS
-from pipeline.report.render.folder import Made
 from pipeline.report.render.pdf import missing_characters
-from pipeline.report.render.write import make_files
+from pipeline.report.render.write import Made, make_files
 from pipeline.report.sections.housekeeping import (
     assumption_blocks,
     check_blocks,

@@ -1,22 +1,57 @@
 """Write the report of a submission into a folder, for `cartlab report` and for the desk."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.json_files import json_text
 from pipeline.output import clear_files, own_folder, write_file
-from pipeline.report.gap.load_gap import with_gap
-from pipeline.report.lab_report.files import NAME, PAGE_AND_PDF, Draft, Files
+from pipeline.report.gap.gap_files import with_gap
 from pipeline.report.plots import NAME as PLOTS
-from pipeline.report.render.folder import Made, write_files
+from pipeline.report.render.write import Made, write_files
 from pipeline.results import Analysis
 from pipeline.submission import Submission
 from pipeline.words.progress import Progress
-from pipeline.workflow import analyse
 
 if TYPE_CHECKING:
     from pipeline.report.lab_report.changes import DraftChanges
+
+NAME = "report"  # of the page and the PDF
+
+
+@dataclass(frozen=True, kw_only=True)
+class Files:
+    """Which files are made in addition to `report.html` and `figures/`.
+
+    Attributes
+    ----------
+    tables : write `tables/*.csv` and `results.mat`.
+    plots : make the page with plots of all recordings, and link it in the report.
+    """
+
+    pdf: bool = True
+    tables: bool = False
+    plots: bool = False
+
+
+PAGE_AND_PDF = Files()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draft:
+    """A report that was made.
+
+    Attributes
+    ----------
+    files : contents of the pages and figures.
+    summary : what was found, for a terminal.
+    remarks : lines on the changes and on the open questions.
+    """
+
+    files: Made
+    summary: str
+    remarks: tuple[str, ...]
 
 
 def make_report(
@@ -36,6 +71,8 @@ def make_report(
         `results.json` is overwritten.
     make : `make_draft`, or a function that calls it in another process.
     """
+    from pipeline.workflow import analyse  # late: the process that draws does not need it
+
     analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
     changes = compared(analysis)
     tables = own_folder(out, "tables")

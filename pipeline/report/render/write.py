@@ -1,15 +1,21 @@
-"""Make a document's files: the page, the PDF and the figures."""
+"""Make a document's files (the page, the PDF and the figures) and write them into a folder."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
+from pipeline.output import clear_files, own_folder, write_file
 from pipeline.report.document import Document
-from pipeline.report.render.folder import FIGURES, Made, write_files
-from pipeline.report.render.html import render_html
-from pipeline.report.render.pdf import render_pdf
+
+Made = Mapping[str, str | bytes]  # contents of files by their paths in the folder
+FIGURES = "figures"  # folder of the figures
 
 
 def make_files(document: Document, *, name: str, pdf: bool) -> Made:
     """Return `figures/*.svg`, `name.html` and, if asked for, `name.pdf`."""
+    # Imported late, because programs that only write the files need no renderer.
+    from pipeline.report.render.html import render_html
+    from pipeline.report.render.pdf import render_pdf
+
     drawn = {f"{FIGURES}/{one.name}.svg": one.svg for one in document.pictures()}
     printed = {f"{name}.pdf": render_pdf(document)} if pdf else {}
     return {**drawn, f"{name}.html": render_html(document), **printed}
@@ -18,3 +24,21 @@ def make_files(document: Document, *, name: str, pdf: bool) -> Made:
 def write_document(document: Document, out: Path, *, name: str, pdf: bool) -> None:
     """Make a document's files and write them into the folder `out`."""
     write_files(make_files(document, name=name, pdf=pdf), out, name=name)
+
+
+def write_files(made: Made, out: Path, *, name: str) -> None:
+    """Write the files of a document in place of those of an earlier one.
+
+    All files are made before the first one is written, so an interrupted run leaves the earlier
+    document complete.
+
+    Parameters
+    ----------
+    name : name of the page and the PDF, without ending.
+    """
+    figures = own_folder(out, FIGURES)
+    figures.mkdir(parents=True, exist_ok=True)
+    clear_files(figures, "*.svg")
+    clear_files(out, f"{name}.pdf")
+    for file, content in made.items():
+        write_file(out / file, content)

@@ -5,7 +5,7 @@ import numpy as np
 from pipeline.arrays import Array, ComplexArray
 from pipeline.report.builder import Page, remarks
 from pipeline.report.document import Block, Code, Table, paragraph
-from pipeline.report.equations.feedback import controller_equations, matlab_code, weights_formula
+from pipeline.report.equations.model import controller_equations, matlab_code, weights_formula
 from pipeline.report.figures.time import design_figure, hardware_figure
 from pipeline.results import FeedbackDesign, HardwareCheck, Margins
 from pipeline.words.numbers import NOTHING, complex_text, count, percent, significant, unit_text

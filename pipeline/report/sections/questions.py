@@ -14,9 +14,8 @@ import numpy as np
 from pipeline.estimation.estimates import DAMPING_LIMIT
 from pipeline.names import read_name
 from pipeline.report.document import Block, Heading, Paragraph, Question, Section, paragraph
-from pipeline.report.sections.answers import named
 from pipeline.report.sections.loops import CLOSE
-from pipeline.report.sections.notes import discussion_blocks, even_headings
+from pipeline.report.sections.notes import discussion_blocks, even_headings, named
 from pipeline.report.sections.parameters import source_text
 from pipeline.results import Analysis, HardwareCheck, ParameterRow
 from pipeline.words.numbers import count, listing, percent, significant

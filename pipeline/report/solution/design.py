@@ -11,8 +11,7 @@ from pipeline.plant.sampled_loop import discretise
 from pipeline.report.builder import Page
 from pipeline.report.document import Block, bullet_list, paragraph
 from pipeline.report.equations.algebra import value_term
-from pipeline.report.equations.feedback import weights_formula
-from pipeline.report.equations.model import formula, matlab_matrix, number_matrix
+from pipeline.report.equations.model import formula, matlab_matrix, number_matrix, weights_formula
 from pipeline.results import FeedbackDesign
 from pipeline.words.math import Math, Term, fraction, matrix, parens, power, row, total
 from pipeline.words.numbers import complex_text, percent, significant

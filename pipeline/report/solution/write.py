@@ -8,7 +8,7 @@ from pipeline.grading.rubric import Rubric
 from pipeline.output import write_file
 from pipeline.report.builder import Part
 from pipeline.report.document import Document, Paragraph, paragraph
-from pipeline.report.gap.load_gap import with_gap
+from pipeline.report.gap.gap_files import with_gap
 from pipeline.report.lab_report.content import build_document
 from pipeline.report.render.write import write_document
 from pipeline.report.sections.questions import Asked

@@ -13,7 +13,6 @@ from pipeline.names import read_name
 from pipeline.output import write_file
 from pipeline.report.builder import Page
 from pipeline.report.document import Block, Heading, Tile, Tiles, Tone, paragraph
-from pipeline.report.exploration import NAME
 from pipeline.report.figures import QUIET, SECOND
 from pipeline.report.figures.style import legend_above, log_scale, panels
 from pipeline.report.gap.gap_report import before_after_picture
@@ -25,6 +24,8 @@ from pipeline.words.phrases import phrases
 from pipeline.words.text import capital, clean, name_span, rich, spans, symbol_text
 
 _WORDS = phrases("exploration")
+
+NAME = "exploration.html"  # in the folder of the submission
 
 
 def write_diary(turns: Sequence[Turn], analysis: Analysis, folder: Path, *, wanted: float) -> Path:

@@ -1,1 +1,0 @@
-"""The catalogue of effects, as text and as a page with pictures."""
