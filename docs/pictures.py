@@ -11,7 +11,7 @@ from playwright.sync_api import ViewportSize, sync_playwright
 from pipeline.cli.demo import demo
 from pipeline.desk.app import DeskServer
 from pipeline.output import write_file
-from pipeline.report.lab_report.content import build_document
+from pipeline.report.lab_report import build_document
 from pipeline.report.solution.write import build_solution
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.simulated.submission import write_submission

@@ -23,7 +23,7 @@ from pipeline.cli.reports import explain, run_report
 from pipeline.gap.types import Gap, read_gap
 from pipeline.output import write_file
 from pipeline.report.figures.style import drawing, panels, to_svg
-from pipeline.report.lab_report.write import Files
+from pipeline.report.make_report import Files
 from pipeline.results import Analysis, LogDecrement
 from pipeline.words.numbers import with_error
 from pipeline.words.text import with_symbols

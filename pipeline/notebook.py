@@ -17,10 +17,10 @@ from pipeline.plant.margins import closed_loop
 from pipeline.plant.motion import EquationsOfMotion
 from pipeline.report import gap_tables, tables
 from pipeline.report.document import Block, Document, Heading
-from pipeline.report.gap.gap_files import with_gap
-from pipeline.report.gap.verdict import terminal_verdict
-from pipeline.report.lab_report.content import build_document
-from pipeline.report.render.html import render_fragment
+from pipeline.report.gap_files import with_gap
+from pipeline.report.gap_verdict import terminal_verdict
+from pipeline.report.html import render_fragment
+from pipeline.report.lab_report import build_document
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.results import Analysis, FeedbackDesign

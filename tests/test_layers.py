@@ -40,8 +40,8 @@ OTHERS = {
 }
 HOMES = {
     "matplotlib": ("report",),
-    "jinja2": ("report.render", "submission", "desk", "plant.export"),
-    "typst": ("report.render",),
+    "jinja2": ("report.html", "submission", "desk", "plant.export"),
+    "typst": ("report.pdf",),
     "markdown_it": ("report.sections",),
     "typer": ("cli",),
     "rich": ("cli", "bench"),

@@ -10,7 +10,7 @@ from pipeline.errors import ConfigError
 from pipeline.notebook import ExplainedGap, explain
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.effect import effect_name
-from pipeline.report.plots.runs import compare_runs
+from pipeline.report.compared_runs import compare_runs
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.simulated.submission import write_submission
 from pipeline.words.progress import silent

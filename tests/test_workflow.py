@@ -15,8 +15,8 @@ from pipeline.estimation.record_fit import record_fits
 from pipeline.json_files import json_text
 from pipeline.notebook import Lab
 from pipeline.plant.chain import PRESETS
-from pipeline.report.lab_report.content import build_document
-from pipeline.report.render.html import render_html
+from pipeline.report.html import render_html
+from pipeline.report.lab_report import build_document
 from pipeline.report.solution.write import build_solution
 from pipeline.report.tables import matlab_file
 from pipeline.resources import EXAMPLES

@@ -15,7 +15,7 @@ from pipeline.gap.explain import investigate
 from pipeline.identify.findings import say
 from pipeline.names import read_name, toml_flags
 from pipeline.plant.chain import PRESETS, Chain
-from pipeline.report.gap.verdict import terminal_verdict
+from pipeline.report.gap_verdict import terminal_verdict
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.results import Analysis

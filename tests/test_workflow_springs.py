@@ -14,7 +14,7 @@ from pipeline.json_files import json_text
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.report.builder import Page
-from pipeline.report.lab_report.content import build_document
+from pipeline.report.lab_report import build_document
 from pipeline.report.sections.parameters import parameter_table
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.resources import EXAMPLES

@@ -22,7 +22,7 @@ def demo(
 ) -> None:
     """Try everything: an example report, a class of three, a bench with hidden friction."""
     from pipeline.output import named_folder
-    from pipeline.report.lab_report.write import Files
+    from pipeline.report.make_report import Files
     from pipeline.resources import EXAMPLES
     from pipeline.simulated.examples import PLANTED, PRESET, write_class
 

@@ -15,8 +15,8 @@ from pipeline.second_process import SecondProcess
 from pipeline.words.progress import Progress
 
 if TYPE_CHECKING:
-    from pipeline.report.lab_report.changes import DraftChanges
-    from pipeline.report.lab_report.write import Files
+    from pipeline.report.changes import DraftChanges
+    from pipeline.report.make_report import Files
     from pipeline.results import Analysis
     from pipeline.submission import Submission
 
@@ -144,7 +144,7 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Identify the carts, design the controller, check the hardware, write the report."""
-    from pipeline.report.lab_report.write import Files
+    from pipeline.report.make_report import Files
 
     files = Files(pdf=pdf, tables=tables, plots=plots)
     analysis = run_report(folder, out=out, files=files, compare=compare)
@@ -168,10 +168,10 @@ def run_report(
     A second process loads what draws the report while this one loads what analyses the data. The
     desk shows a complete report in the submission's own folder as one of its own.
     """
-    with SecondProcess("pipeline.report.lab_report.content", "make_draft") as second:
+    with SecondProcess("pipeline.report.lab_report", "make_draft") as second:
         from pipeline.desk.last_report import stat_sources, write_findings
         from pipeline.output import named_folder, own_folder
-        from pipeline.report.lab_report.write import make_report
+        from pipeline.report.make_report import make_report
 
         # Note the state before the files are read, so that the desk notices a later change.
         made_of = stat_sources(folder)
@@ -216,7 +216,7 @@ def _comparison(
     """
     if earlier is None:
         return lambda analysis: None
-    from pipeline.report.lab_report.changes import check_comparable, compare_drafts, read_results
+    from pipeline.report.changes import check_comparable, compare_drafts, read_results
 
     before = read_results(earlier)
     check_comparable(before, bench=submission.system.bench)
@@ -330,7 +330,7 @@ def explain(
     progress: Progress,
 ) -> tuple[str, list[str]]:
     """Write the gap analysis of a submission; return the text of gap.json and the messages."""
-    with SecondProcess("pipeline.report.gap.gap_report", "make_gap_files") as second:
+    with SecondProcess("pipeline.report.gap_report", "make_gap_files") as second:
         from pipeline.json_files import json_text
         from pipeline.output import named_folder, own_folder, write_file
         from pipeline.workflow import analyse
@@ -341,9 +341,9 @@ def explain(
         # These imports load the compiled simulator.
         from pipeline.experiments.discriminate import propose_for
         from pipeline.gap.explain import investigate
-        from pipeline.report.gap.gap_files import clear_model, save_model
-        from pipeline.report.gap.verdict import terminal_verdict
-        from pipeline.report.render.write import write_files
+        from pipeline.report.files import write_files
+        from pipeline.report.gap_files import clear_model, save_model
+        from pipeline.report.gap_verdict import terminal_verdict
 
         found = investigate(analysis, budget=budget, progress=progress)
         progress("choosing the next recording")

@@ -5,7 +5,7 @@ from itertools import count
 from pipeline.grading.grade import Criterion
 from pipeline.grading.publish.feedback import numbers_table, sentence
 from pipeline.report.document import paragraph
-from pipeline.report.render.html import render_blocks
+from pipeline.report.html import render_blocks
 from pipeline.setup import Units
 from pipeline.words.text import rich
 

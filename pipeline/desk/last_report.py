@@ -13,7 +13,7 @@ from pipeline.submission.load import MAX_NOTES_BYTES, NAME, file_problem, list_e
 from pipeline.submission.toml import find_deep_key, read_text
 
 if TYPE_CHECKING:
-    from pipeline.report.lab_report.changes import DraftChanges
+    from pipeline.report.changes import DraftChanges
     from pipeline.results import Analysis, Assumption
 
 # A file next to the report: its questions, assumptions, findings, and state of its sources.
@@ -114,7 +114,7 @@ def write_findings(
     made_of : the sources, as `stat_sources` found them before they were read.
     """
     # Imported late, because only a process that has made a report needs them.
-    from pipeline.report.lab_report.changes import changes_line
+    from pipeline.report.changes import changes_line
     from pipeline.report.sections.housekeeping import taken_text
     from pipeline.report.sections.questions import ask
     from pipeline.words.text import with_symbols

@@ -7,7 +7,7 @@ from starlette.responses import FileResponse, Response
 
 from pipeline.bench.live_page import LIVE_FILES
 from pipeline.desk.page_request import PageRequest
-from pipeline.report.render.html import every_hash
+from pipeline.report.html import every_hash
 from pipeline.resources import TEMPLATES
 from pipeline.submission.load import file_problem
 

@@ -82,9 +82,9 @@ def fill_tables(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
 
 def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
     """Write the report into the submission's folder, and compare it with the previous one."""
-    from pipeline.report.lab_report.changes import compare_drafts, read_results
-    from pipeline.report.lab_report.content import make_draft
-    from pipeline.report.lab_report.write import make_report as write_report
+    from pipeline.report.changes import compare_drafts, read_results
+    from pipeline.report.lab_report import make_draft
+    from pipeline.report.make_report import make_report as write_report
 
     # Note the state before the files are read, so that a later change is noticed.
     made_of = stat_sources(Path(folder))
@@ -109,9 +109,9 @@ def make_gap(folder: str, *, progress: Progress) -> None:
     from pipeline.experiments.discriminate import propose_for
     from pipeline.gap.explain import investigate
     from pipeline.json_files import json_text
-    from pipeline.report.gap.gap_files import clear_model
-    from pipeline.report.gap.gap_report import make_gap_files
-    from pipeline.report.render.write import write_files
+    from pipeline.report.files import write_files
+    from pipeline.report.gap_files import clear_model
+    from pipeline.report.gap_report import make_gap_files
     from pipeline.workflow import analyse
 
     submission = load_submission(Path(folder))
@@ -128,8 +128,8 @@ def make_gap(folder: str, *, progress: Progress) -> None:
 
 def make_plots(folder: str, *, progress: Progress) -> None:
     """Write the page of plots into the submission's folder, next to its report."""
-    from pipeline.report.gap.gap_files import with_gap
-    from pipeline.report.plots.page import write_plots
+    from pipeline.report.compare import write_plots
+    from pipeline.report.gap_files import with_gap
     from pipeline.workflow import analyse
 
     # Note the state before the files are read, as for a report.
@@ -288,7 +288,7 @@ def grade_submissions(
 def render_notes(folder: str, *, progress: Progress) -> str:
     """Return a team's `notes.md` as HTML; "" without notes. No text in it is markup."""
     from pipeline.report.document import paragraph
-    from pipeline.report.render.html import render_blocks
+    from pipeline.report.html import render_blocks
     from pipeline.report.sections.notes import even_headings, note_blocks
     from pipeline.submission.load import load_notes
 

@@ -319,7 +319,7 @@ class Exploration:
     folder : the submission's folder.
     record : function that makes recordings of the plan, given by their ids. Its first call also
         makes submission and plan if they are missing.
-    write_diary : function that writes the page of all turns; see `report.exploration.diary`.
+    write_diary : function that writes the page of all turns; see `report.exploration`.
     known_commands : function that returns the extensions of the protocol that the bench knows.
     goal : the errors to reach.
     seconds : time allowed at the bench, including rests. A recording that would exceed it is not

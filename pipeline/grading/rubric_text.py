@@ -10,7 +10,7 @@ from pipeline.grading.rubric import (
     matching,
 )
 from pipeline.names import read_name
-from pipeline.report.render.html import render_text
+from pipeline.report.html import render_text
 from pipeline.submission.load import spring_names
 
 

@@ -18,7 +18,7 @@ from pipeline.report.effect_texts import INPUT, POSITION, parameter_text
 from pipeline.report.equations.model import formula
 from pipeline.report.figures import MODEL, QUIET, SECOND, SECOND_LINE
 from pipeline.report.figures.style import legend_above, log_scale, panels, position_label
-from pipeline.report.render.write import write_document
+from pipeline.report.files import write_document
 from pipeline.simulated.hidden import usual_term
 from pipeline.words.numbers import significant, subscript
 from pipeline.words.phrases import phrases

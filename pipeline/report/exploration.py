@@ -15,9 +15,9 @@ from pipeline.report.builder import Page
 from pipeline.report.document import Block, Heading, Tile, Tiles, Tone, paragraph
 from pipeline.report.figures import QUIET, SECOND
 from pipeline.report.figures.style import legend_above, log_scale, panels
-from pipeline.report.gap.gap_report import before_after_picture
-from pipeline.report.gap.verdict import error_board, verdict_blocks, verdict_title
-from pipeline.report.render.html import render_html
+from pipeline.report.gap_report import before_after_picture
+from pipeline.report.gap_verdict import error_board, verdict_blocks, verdict_title
+from pipeline.report.html import render_html
 from pipeline.results import Analysis
 from pipeline.words.numbers import NOTHING, count, listing, unit_text, with_error
 from pipeline.words.phrases import phrases

@@ -25,8 +25,8 @@ from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain
-from pipeline.report.gap.gap_report import build_gap_document
-from pipeline.report.render.html import render_html
+from pipeline.report.gap_report import build_gap_document
+from pipeline.report.html import render_html
 from pipeline.resources import EXAMPLES
 from pipeline.results import Provenance
 from pipeline.setup import Setup, Units

@@ -13,7 +13,7 @@ from pipeline.ingest.fill import fill_submission
 from pipeline.ingest.read import read_data
 from pipeline.json_files import file_model, json_text
 from pipeline.report.document import Table
-from pipeline.report.lab_report.content import build_document
+from pipeline.report.lab_report import build_document
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Assumption, HeadingUnit

@@ -8,7 +8,7 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.json_files import json_text
 from pipeline.report.builder import Page
-from pipeline.report.lab_report.changes import (
+from pipeline.report.changes import (
     Draft,
     change_blocks,
     changes_line,
@@ -113,7 +113,7 @@ def test_other_units_or_carts_are_refused_before_the_analysis(tmp_path, monkeypa
     def analysed_after_all(*_, **__):
         pytest.fail("the analysis ran")
 
-    monkeypatch.setattr("pipeline.report.lab_report.write.analyse", analysed_after_all)
+    monkeypatch.setattr("pipeline.workflow.analyse", analysed_after_all)
     earlier = json.loads(json_text(analysed("one-cart")))
     earlier["submission"][key] = other
     path = tmp_path / "earlier.json"

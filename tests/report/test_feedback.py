@@ -18,7 +18,7 @@ from pipeline.json_files import json_text
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.report.builder import Page
 from pipeline.report.document import Table
-from pipeline.report.render.html import render_fragment
+from pipeline.report.html import render_fragment
 from pipeline.report.sections.loops import feedback_blocks, margin_rows
 from pipeline.results import Analysis, FeedbackDesign, Stage
 from pipeline.setup import Setup

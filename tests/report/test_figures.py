@@ -289,7 +289,7 @@ def test_the_users_matplotlib_settings_do_not_matter():
 def test_the_report_imports_only_what_it_needs():
     """The report imports neither pyplot nor pandas nor python-control, to save a second."""
     code = (
-        "import sys, pipeline.report.render.write; "
+        "import sys, pipeline.report.files; "
         "print([m for m in ('matplotlib.pyplot', 'pandas', 'control', 'numba', 'scipy.signal') "
         "if m in sys.modules])"
     )

@@ -35,12 +35,12 @@ from pipeline.plant.simulator.generated_forces import shaped_input
 from pipeline.report.document import Document, Formula, paragraph, plain_lines
 from pipeline.report.equations.model import augmented_equations, in_order, law
 from pipeline.report.figures.gap import predicted_figure
-from pipeline.report.gap.gap_files import with_gap
-from pipeline.report.gap.gap_report import LEGEND, build_gap_document, make_gap_files
-from pipeline.report.gap.verdict import WORDS, added_name, kept_together, share, terminal_verdict
-from pipeline.report.lab_report.content import build_document
-from pipeline.report.render.html import render_html
-from pipeline.report.render.write import write_files
+from pipeline.report.files import write_files
+from pipeline.report.gap_files import with_gap
+from pipeline.report.gap_report import LEGEND, build_gap_document, make_gap_files
+from pipeline.report.gap_verdict import WORDS, added_name, kept_together, share, terminal_verdict
+from pipeline.report.html import render_html
+from pipeline.report.lab_report import build_document
 from pipeline.submission import load_submission
 from pipeline.words.math import to_text
 from pipeline.words.text import plain

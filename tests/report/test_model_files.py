@@ -11,7 +11,7 @@ from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain
 from pipeline.plant.export import Description, c_sources
-from pipeline.report.gap.gap_files import FILES, clear_model, save_model
+from pipeline.report.gap_files import FILES, clear_model, save_model
 from pipeline.results import Analysis
 from pipeline.setup import Units
 from tests.helpers.effects import SIZES, make_term

@@ -17,8 +17,8 @@ from pipeline.report.document import (
     Section,
     Table,
 )
-from pipeline.report.render.html import render_html
-from pipeline.report.render.pdf import render_pdf
+from pipeline.report.html import render_html
+from pipeline.report.pdf import render_pdf
 from pipeline.report.sections.notes import even_headings, note_blocks
 from pipeline.words.text import plain
 

@@ -13,9 +13,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.arrays import Array
-from pipeline.report.plots.page import (
+from pipeline.report.compare import (
     MOST_LINES,
-    NAME,
     amplitude_spectrum,
     keep_extremes,
     pack,
@@ -24,7 +23,8 @@ from pipeline.report.plots.page import (
     thin_lines,
     write_plots,
 )
-from pipeline.report.plots.runs import ComparedCart, ComparedRun, compare_runs
+from pipeline.report.compared_runs import ComparedCart, ComparedRun, compare_runs
+from pipeline.report.make_report import COMPARE
 from pipeline.results import Analysis
 from pipeline.words.progress import silent
 from tests.helpers.analysis_factory import make_analysis
@@ -171,7 +171,7 @@ def test_the_page_is_small_valid_and_the_same_every_time(tmp_path):
     analysis = analysed("three-cart")
     for _ in range(2):
         write_plots(analysis, tmp_path, gap=None, progress=silent)
-        (tmp_path / NAME).rename(tmp_path / f"{len(list(tmp_path.iterdir()))}.html")
+        (tmp_path / COMPARE).rename(tmp_path / f"{len(list(tmp_path.iterdir()))}.html")
     first, second = (path.read_bytes() for path in sorted(tmp_path.iterdir()))
 
     assert first == second

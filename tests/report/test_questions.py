@@ -9,9 +9,9 @@ import pypdf
 import pytest
 
 from pipeline.report.document import Document, Paragraph, Question, Section, paragraph
-from pipeline.report.lab_report.content import build_document
-from pipeline.report.render.html import render_html
-from pipeline.report.render.pdf import render_pdf
+from pipeline.report.html import render_html
+from pipeline.report.lab_report import build_document
+from pipeline.report.pdf import render_pdf
 from pipeline.report.sections.notes import discussion_blocks
 from pipeline.report.sections.questions import ask, open_line, placed, split_notes
 from pipeline.resources import EXAMPLES

@@ -26,10 +26,10 @@ from pipeline.report.document import (
     cell,
     make_table,
 )
-from pipeline.report.lab_report.content import build_document, make_draft
-from pipeline.report.lab_report.write import Files, write_draft
-from pipeline.report.render.html import render_blocks, render_html
-from pipeline.report.render.pdf import missing_characters, render_pdf
+from pipeline.report.html import render_blocks, render_html
+from pipeline.report.lab_report import build_document, make_draft
+from pipeline.report.make_report import Files, write_draft
+from pipeline.report.pdf import missing_characters, render_pdf
 from pipeline.report.sections.housekeeping import file_table, provenance_blocks
 from pipeline.report.sections.measurements import decay_blocks
 from pipeline.report.sections.summary import summary, terminal_summary

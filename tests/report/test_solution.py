@@ -23,9 +23,8 @@ from pipeline.report.document import Formula
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, shown, shown_with, value_term, work_out
 from pipeline.report.equations.derivation import work_state_model
-from pipeline.report.render.html import render_html
+from pipeline.report.html import render_html
 from pipeline.report.sections.questions import Asked, QuestionKind, ask
-from pipeline.report.solution.design import work_design
 from pipeline.report.solution.expected import (
     check_carts,
     default_rubric,
@@ -33,6 +32,7 @@ from pipeline.report.solution.expected import (
     expected_parameters,
     solution_text,
 )
+from pipeline.report.solution.worked import work_design
 from pipeline.report.solution.write import build_solution, model_answer
 from pipeline.resources import RUBRICS
 from pipeline.setup import Setup

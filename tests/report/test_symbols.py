@@ -9,8 +9,8 @@ import pytest
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.publish.view import new_view
-from pipeline.report.lab_report.content import build_document
-from pipeline.report.render.html import render_html
+from pipeline.report.html import render_html
+from pipeline.report.lab_report import build_document
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.report.solution.write import build_solution
 from pipeline.words.text import breakable

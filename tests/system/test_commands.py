@@ -37,7 +37,7 @@ def test_a_command_loads_only_what_it_needs():
     """`--help` loads no numpy, `report` no effects, and `grade` leaves the analysis to workers."""
     for module, unneeded in (
         ("cli", {"numpy"}),
-        ("report.lab_report.write", {"pipeline.plant.catalogue", "scipy.ndimage", "control"}),
+        ("report.make_report", {"pipeline.plant.catalogue", "scipy.ndimage", "control"}),
         ("grading.batch.grade_class", {"pipeline.workflow", "scipy.linalg", "pandas"}),
     ):
         code = f"import sys, pipeline.{module}; print({unneeded} & set(sys.modules))"

@@ -6,8 +6,8 @@ import pytest
 from playwright.sync_api import expect
 
 from pipeline.desk.app import DeskServer
-from pipeline.report.plots.page import render_page
-from pipeline.report.plots.runs import compare_runs
+from pipeline.report.compare import render_page
+from pipeline.report.compared_runs import compare_runs
 from pipeline.words.progress import silent
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.desks import a_submission

@@ -13,10 +13,10 @@ import pytest
 
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.report.effects import render_effects
-from pipeline.report.gap.gap_report import make_gap_files
-from pipeline.report.lab_report.content import make_draft
-from pipeline.report.lab_report.write import write_draft
-from pipeline.report.render.write import write_files
+from pipeline.report.files import write_files
+from pipeline.report.gap_report import make_gap_files
+from pipeline.report.lab_report import make_draft
+from pipeline.report.make_report import write_draft
 from pipeline.report.solution.write import render_solution
 from pipeline.results import Analysis
 from pipeline.submission import load_submission

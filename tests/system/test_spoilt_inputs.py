@@ -22,8 +22,8 @@ from pipeline.grading.publish.survey import read_survey, survey_dict, survey_tex
 from pipeline.grading.publish.view import new_view
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.json_files import json_text
-from pipeline.report.gap.verdict import terminal_verdict
-from pipeline.report.lab_report.changes import compare_drafts, read_results
+from pipeline.report.changes import compare_drafts, read_results
+from pipeline.report.gap_verdict import terminal_verdict
 from pipeline.resources import RUBRICS
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission

@@ -31,7 +31,7 @@ from pipeline.grading.similarity.distant import find_distant, recomputed_numbers
 from pipeline.grading.words import WORDS, points_text, signed_points
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import drawing, to_svg
-from pipeline.report.render.html import render_drawing
+from pipeline.report.html import render_drawing
 from pipeline.words.text import capital
 
 _ROWS = 50  # rows of one page

@@ -17,7 +17,7 @@ from pipeline.grading.rubric import Criterion as Asked
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import WORDS, points_text
 from pipeline.names import read_name
-from pipeline.report.render.html import render_blocks
+from pipeline.report.html import render_blocks
 from pipeline.setup import Units
 from pipeline.words.numbers import NOTHING
 from pipeline.words.text import capital, name_span, with_symbols

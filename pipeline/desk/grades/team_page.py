@@ -54,7 +54,7 @@ from pipeline.grading.publish.class_page import feedback_link
 from pipeline.grading.publish.view import view
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import WORDS, person_lines, points_text
-from pipeline.report.render.html import render_drawing
+from pipeline.report.html import render_drawing
 from pipeline.words.text import capital
 
 _POINTS = "points"  # part of the page where points are changed

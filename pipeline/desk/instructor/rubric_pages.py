@@ -33,9 +33,8 @@ from pipeline.grading.rubric_file import rubric_source
 from pipeline.grading.rubric_text import rubric_text
 from pipeline.output import write_file
 from pipeline.report.figures.grading import two_distributions_figure
-from pipeline.report.figures.style import drawing
-from pipeline.report.figures.svg import plain_svg, to_svg
-from pipeline.report.render.html import render_drawing
+from pipeline.report.figures.style import drawing, to_svg
+from pipeline.report.html import render_drawing
 from pipeline.resources import RUBRICS
 from pipeline.submission.edit import Stale, require_version, text_digest
 
@@ -277,9 +276,7 @@ def draw_preview(ask: PageRequest) -> Response:
     with drawing():
         figure = two_distributions_figure(before, after)
         alt = "Histograms of the points, before and after."
-        return show_drawing(
-            render_drawing(plain_svg(to_svg(figure, name="distributions", alt=alt)))
-        )
+        return show_drawing(render_drawing(to_svg(figure, name="distributions", alt=alt)))
 
 
 def _read_bars(text: str) -> list[int]:

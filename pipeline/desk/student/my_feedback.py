@@ -21,7 +21,7 @@ from pipeline.grading.publish.view import GradeView, view
 from pipeline.grading.rubric import Criterion as Asked
 from pipeline.grading.words import WORDS, person_lines, points_text, waiting_text
 from pipeline.report.document import paragraph
-from pipeline.report.render.html import render_blocks
+from pipeline.report.html import render_blocks
 from pipeline.words.numbers import NOTHING
 from pipeline.words.text import capital, rich
 

@@ -31,7 +31,7 @@ from pipeline.report.document import (
     paragraph,
 )
 from pipeline.report.figures.grading import difficulty_figure, distribution_figure
-from pipeline.report.render.html import render_html
+from pipeline.report.html import render_html
 from pipeline.words.numbers import NOTHING, first_few, listing
 from pipeline.words.numbers import count as counted
 from pipeline.words.text import Span, Spans, capital, clean, spans

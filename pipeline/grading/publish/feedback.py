@@ -29,7 +29,7 @@ from pipeline.report.document import (
     make_table,
     paragraph,
 )
-from pipeline.report.render.html import render_html
+from pipeline.report.html import render_html
 from pipeline.setup import Units
 from pipeline.words.numbers import NOTHING, percent, significant, typeset, unit_text
 from pipeline.words.numbers import count as counted

@@ -8,18 +8,22 @@ from pipeline.grading.rubric import Rubric
 from pipeline.output import write_file
 from pipeline.report.builder import Part
 from pipeline.report.document import Document, Paragraph, paragraph
-from pipeline.report.gap.gap_files import with_gap
-from pipeline.report.lab_report.content import build_document
-from pipeline.report.render.write import write_document
+from pipeline.report.files import write_document
+from pipeline.report.gap_files import with_gap
+from pipeline.report.lab_report import build_document
 from pipeline.report.sections.questions import Asked
-from pipeline.report.solution.design import design_blocks
 from pipeline.report.solution.expected import (
     check_carts,
     default_rubric,
     expected_blocks,
     solution_text,
 )
-from pipeline.report.solution.model import motion_blocks, state_blocks, transfer_blocks
+from pipeline.report.solution.worked import (
+    design_blocks,
+    motion_blocks,
+    state_blocks,
+    transfer_blocks,
+)
 from pipeline.results import Analysis
 from pipeline.submission import Submission
 from pipeline.words.numbers import count

@@ -13,8 +13,8 @@ FIGURES = "figures"  # folder of the figures
 def make_files(document: Document, *, name: str, pdf: bool) -> Made:
     """Return `figures/*.svg`, `name.html` and, if asked for, `name.pdf`."""
     # Imported late, because programs that only write the files need no renderer.
-    from pipeline.report.render.html import render_html
-    from pipeline.report.render.pdf import render_pdf
+    from pipeline.report.html import render_html
+    from pipeline.report.pdf import render_pdf
 
     drawn = {f"{FIGURES}/{one.name}.svg": one.svg for one in document.pictures()}
     printed = {f"{name}.pdf": render_pdf(document)} if pdf else {}

@@ -21,6 +21,7 @@ from pipeline.arrays import Array
 from pipeline.gap.types import Gap
 from pipeline.output import write_file
 from pipeline.report.builder import Page
+from pipeline.report.compared_runs import ComparedCart, ComparedRun, compare_runs
 from pipeline.report.document import Picture
 from pipeline.report.figures.style import (
     drawing,
@@ -32,10 +33,9 @@ from pipeline.report.figures.style import (
     plot_second,
     position_label,
 )
-from pipeline.report.gap.verdict import added_name, share
-from pipeline.report.plots import NAME
-from pipeline.report.plots.runs import ComparedCart, ComparedRun, compare_runs
-from pipeline.report.render.html import render_plots
+from pipeline.report.gap_verdict import added_name, share
+from pipeline.report.html import render_plots
+from pipeline.report.make_report import COMPARE
 from pipeline.results import Analysis
 from pipeline.words.numbers import count, subscript
 from pipeline.words.phrases import phrases
@@ -59,7 +59,7 @@ MOST_LINES = 400  # lines on a logarithmic axis; finer than a screen can show
 def write_plots(analysis: Analysis, out: Path, *, gap: Gap | None, progress: Progress) -> None:
     """Write the page of plots into a folder."""
     beside = (out / "report.html").is_file()
-    write_file(out / NAME, make_page(analysis, gap=gap, report=beside, progress=progress))
+    write_file(out / COMPARE, make_page(analysis, gap=gap, report=beside, progress=progress))
 
 
 def make_page(analysis: Analysis, *, gap: Gap | None, report: bool, progress: Progress) -> str:

@@ -43,7 +43,8 @@ from pipeline.report.figures.style import (
     plot_second,
     position_label,
 )
-from pipeline.report.gap.verdict import (
+from pipeline.report.files import Made, make_files
+from pipeline.report.gap_verdict import (
     WORDS,
     added_name,
     contenders,
@@ -59,7 +60,6 @@ from pipeline.report.gap.verdict import (
     verdict_title,
     whole_model,
 )
-from pipeline.report.render.write import Made, make_files
 from pipeline.report.sections.housekeeping import provenance_blocks
 from pipeline.report.sections.parameters import chain_table
 from pipeline.results import Analysis, Intervention

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 
 from pipeline.json_files import json_text
 from pipeline.output import clear_files, own_folder, write_file
-from pipeline.report.gap.gap_files import with_gap
-from pipeline.report.plots import NAME as PLOTS
-from pipeline.report.render.write import Made, write_files
+from pipeline.report.files import Made, write_files
+from pipeline.report.gap_files import with_gap
 from pipeline.results import Analysis
 from pipeline.submission import Submission
 from pipeline.words.progress import Progress
 
 if TYPE_CHECKING:
-    from pipeline.report.lab_report.changes import DraftChanges
+    from pipeline.report.changes import DraftChanges
 
 NAME = "report"  # of the page and the PDF
+COMPARE = "compare.html"  # the page with interactive plots of every recording and its models
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +92,6 @@ def make_report(
 
 def write_draft(made: Made, out: Path) -> None:
     """Write the files of a report in place of those of an earlier one."""
-    if PLOTS not in made:
-        clear_files(out, PLOTS)
+    if COMPARE not in made:
+        clear_files(out, COMPARE)
     write_files(made, out, name=NAME)

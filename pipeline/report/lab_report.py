@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from pipeline import __version__
 from pipeline.report.builder import Page, Part, remarks
+from pipeline.report.changes import DraftChanges, change_blocks, changes_line
 from pipeline.report.document import Block, Document, Heading, Paragraph, paragraph
 from pipeline.report.equations.model import (
     equations_of_motion,
@@ -14,11 +15,9 @@ from pipeline.report.equations.model import (
     symbolic_state_space,
     symbolic_transfer_functions,
 )
-from pipeline.report.lab_report.changes import DraftChanges, change_blocks, changes_line
-from pipeline.report.lab_report.write import NAME, PAGE_AND_PDF, Draft, Files
-from pipeline.report.plots import NAME as PLOTS
-from pipeline.report.render.pdf import missing_characters
-from pipeline.report.render.write import Made, make_files
+from pipeline.report.files import Made, make_files
+from pipeline.report.make_report import COMPARE, NAME, PAGE_AND_PDF, Draft, Files
+from pipeline.report.pdf import missing_characters
 from pipeline.report.sections.housekeeping import (
     assumption_blocks,
     check_blocks,
@@ -152,7 +151,7 @@ def _about_gap(gap: "Gap | None") -> tuple[Blocks, Blocks, Blocks]:
     if gap is None:
         return _nothing, _nothing, _nothing
     # Imported late, because it loads the catalogue of effects.
-    from pipeline.report.gap import gap_report
+    from pipeline.report import gap_report
 
     return (
         lambda _: gap_report.gap_in_short(gap),
@@ -206,11 +205,11 @@ def _make_files(
     if not files.plots:
         return make_files(document, name=NAME, pdf=files.pdf)
     # Imported late, because it loads the catalogue of effects.
-    from pipeline.report.plots.page import make_page
+    from pipeline.report.compare import make_page
 
     plots = make_page(analysis, gap=gap, report=True, progress=progress)
-    document = replace(document, plots=PLOTS)
-    return {**make_files(document, name=NAME, pdf=files.pdf), PLOTS: plots}
+    document = replace(document, plots=COMPARE)
+    return {**make_files(document, name=NAME, pdf=files.pdf), COMPARE: plots}
 
 
 def _students_text(analysis: Analysis) -> str:

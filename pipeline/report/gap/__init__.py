@@ -1,1 +1,0 @@
-"""The gap analysis as a separate report and as a section of the main report."""

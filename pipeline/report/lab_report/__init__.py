@@ -1,1 +1,0 @@
-"""The complete report of a submission, and what has changed since an earlier report."""

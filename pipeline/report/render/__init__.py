@@ -1,1 +1,0 @@
-"""Render a document as HTML and as PDF."""
