@@ -54,7 +54,7 @@ _WITH_BROWSER = {
 _LONGEST = {  # each takes ten seconds or more, so it must not start late
     "desk/test_bench", "desk/test_login", "desk/test_grades", "desk/test_student",
     "experiments/test_exploration", "gap/test_explain",
-    "grading/autograder/test_gradescope", "grading/batch/test_faults_of_the_computer",
+    "grading/test_gradescope", "grading/batch/test_faults_of_the_computer",
     "grading/mistakes/test_faults", "grading/similarity/test_shared_data",
     "grading/test_class_changes", "report/test_gap", "report/test_report", "report/test_solution",
     "simulated/test_hidden", "statistics/test_gap",

@@ -414,7 +414,7 @@ def export_grades(
 
 
 def _export_autograder(rubric: Path, out: Path) -> None:
-    from pipeline.grading.autograder.pack import write_autograder
+    from pipeline.grading.gradescope import write_autograder
 
     for task in write_autograder(rubric, out):
         say(task)

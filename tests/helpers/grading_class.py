@@ -16,9 +16,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.state_feedback import design_feedback
-from pipeline.grading.judge.run import under_rubric
+from pipeline.grading.judge.run import under_rubric, with_all_springs
 from pipeline.grading.mistakes.state_model import own_chain
-from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.names import read_name

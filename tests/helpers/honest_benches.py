@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.grading.grade import Grade
-from pipeline.grading.judge.run import grade_analysis, under_rubric
+from pipeline.grading.judge.run import grade_analysis, under_rubric, with_all_springs
 from pipeline.grading.mistakes.state_model import own_chain
-from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain

@@ -6,8 +6,8 @@ from html import unescape
 
 import pytest
 
+from pipeline.grading.gradescope import results_text
 from pipeline.grading.publish.feedback import feedback_page
-from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.publish.view import new_view
 from pipeline.report.html import render_html
 from pipeline.report.lab_report import build_document

@@ -12,9 +12,9 @@ from pipeline.grading.gradebook.events import Event
 from pipeline.grading.judge.remarks import is_about
 from pipeline.grading.publish.feedback import TONES, alternative, evidence_table, sentence
 from pipeline.grading.publish.feedback_figures import is_response, numbers_in
-from pipeline.grading.references.tolerance import exact, to_step
 from pipeline.grading.rubric import Criterion as Asked
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.tolerance import exact, to_step
 from pipeline.grading.words import WORDS, points_text
 from pipeline.names import read_name
 from pipeline.report.html import render_blocks

@@ -9,8 +9,8 @@ from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import Adjustment, Criterion, Grade, GradeOverride
 from pipeline.grading.gradebook.events import Event
-from pipeline.grading.references.tolerance import exact, with_total
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.tolerance import exact, with_total
 
 _HEADS = ("submission", "criterion", "points", "why")  # columns of a table of requested changes
 

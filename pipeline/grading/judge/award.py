@@ -7,8 +7,8 @@ from pipeline.grading import rubric as asked
 from pipeline.grading.grade import Criterion, Flag, Outcome
 from pipeline.grading.judge.context import Judgement, Verdict
 from pipeline.grading.judge.costs import apply_flag_cost, assign, unnamed
-from pipeline.grading.references.tolerance import exact, to_step
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.tolerance import exact, to_step
 
 
 def award(

@@ -23,12 +23,19 @@ from pipeline.grading.judge.context import (
     share_there,
 )
 from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
-from pipeline.grading.judge.points import ALL, NONE, Deviation, points_for, points_for_one
 from pipeline.grading.mistakes.state_model import model_harm, order_names
 from pipeline.grading.mistakes.undo import Number
-from pipeline.grading.references.reference import OFF_SCALE, Reference, is_linear, off_scale
-from pipeline.grading.references.tolerance import NO_CREDIT, as_typed
+from pipeline.grading.reference import OFF_SCALE, Reference, is_linear, off_scale
 from pipeline.grading.rubric import matching
+from pipeline.grading.tolerance import (
+    ALL,
+    NO_CREDIT,
+    NONE,
+    Deviation,
+    as_typed,
+    points_for,
+    points_for_one,
+)
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.words.numbers import first_few, group_messages

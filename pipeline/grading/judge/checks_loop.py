@@ -10,12 +10,22 @@ from pipeline.arrays import Array
 from pipeline.grading import limits
 from pipeline.grading import rubric as asked
 from pipeline.grading.judge.context import GradingContext, Verdict
-from pipeline.grading.judge.points import ALL, NONE, Deviation, points_for, points_for_one
 from pipeline.grading.mistakes.controller import Controller, does, same_gains
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers
 from pipeline.grading.mistakes.state_model import order_names
-from pipeline.grading.references.reference import OFF_SCALE, Reference, clock_units, off_scale
-from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, exact, percent_off, rounding
+from pipeline.grading.reference import OFF_SCALE, Reference, clock_units, off_scale
+from pipeline.grading.tolerance import (
+    ALL,
+    NO_CREDIT,
+    NONE,
+    Deviation,
+    as_typed,
+    exact,
+    percent_off,
+    points_for,
+    points_for_one,
+    rounding,
+)
 from pipeline.grading.words import WORDS
 from pipeline.results import Stage
 

@@ -8,14 +8,13 @@ from typing import Any
 
 from pipeline.arrays import Array
 from pipeline.grading.grade import Flag
-from pipeline.grading.judge.points import ALL, NONE, Deviation, mean_share
 from pipeline.grading.mistakes.controller import Controller
 from pipeline.grading.mistakes.explain import Label
 from pipeline.grading.mistakes.state_model import MatrixEntry, Order, StateMatrices, compare_entries
 from pipeline.grading.mistakes.undo import Number, Slip, Slipped, all_slips, undo
-from pipeline.grading.references.readings import readings
-from pipeline.grading.references.reference import References
+from pipeline.grading.reference import References, readings
 from pipeline.grading.rubric import RequiredPieces, RequiredRuns, Rubric, matching
+from pipeline.grading.tolerance import ALL, NONE, Deviation, mean_share
 from pipeline.names import read_name
 from pipeline.results import Analysis, ExperimentKind, Finding
 from pipeline.submission import (

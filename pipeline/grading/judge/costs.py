@@ -12,11 +12,10 @@ from fractions import Fraction
 from pipeline.grading import rubric as asked
 from pipeline.grading.grade import CODES, Code, Flag
 from pipeline.grading.judge.context import Judgement, Verdict
-from pipeline.grading.judge.points import ALL, NONE
 from pipeline.grading.judge.remarks import concerns
 from pipeline.grading.mistakes.undo import Slip
-from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.tolerance import ALL, NONE, exact
 from pipeline.grading.words import WORDS
 from pipeline.words.numbers import first_few
 

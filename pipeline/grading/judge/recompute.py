@@ -15,10 +15,9 @@ from pipeline.grading import rubric as asked
 from pipeline.grading.grade import Grade
 from pipeline.grading.judge.award import award
 from pipeline.grading.judge.context import Judgement, Verdict
-from pipeline.grading.judge.points import Deviation, points_for
 from pipeline.grading.mistakes.undo import Slip
-from pipeline.grading.references.tolerance import with_total
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.tolerance import Deviation, points_for, with_total
 
 # Keys of a rubric that change the errors themselves. If one changes, the recordings must be graded
 # again.

@@ -3,13 +3,16 @@
 Numbers that students computed are judged, but the analysis does not use them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from decimal import Decimal
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+
 from pipeline.arrays import Array
-from pipeline.errors import SubmissionError
+from pipeline.errors import PipelineError, SubmissionError
 from pipeline.grading.grade import CODES, Flag, Grade
 from pipeline.grading.judge.award import award
 from pipeline.grading.judge.checks import judge_with_undoing
@@ -20,21 +23,32 @@ from pipeline.grading.mistakes.reduced import diagnose_reduced
 from pipeline.grading.mistakes.state_model import diagnose_state_space, find_order, state_models
 from pipeline.grading.mistakes.tables import diagnose_tables
 from pipeline.grading.mistakes.undo import swapped_order
-from pipeline.grading.references.reference import (
+from pipeline.grading.reference import (
     in_doubt,
     in_scale,
+    is_explained,
+    is_followed,
     is_linear,
     recompute,
     trusted_chain,
 )
-from pipeline.grading.references.signs import accept_reversed_signs
-from pipeline.grading.references.springs import with_all_springs
-from pipeline.grading.references.tolerance import rounding, with_total
 from pipeline.grading.rubric import Rubric
-from pipeline.identify.recording_checks import find_bad_recordings
+from pipeline.grading.tolerance import rounding, with_total
+from pipeline.identify.recording_checks import find_bad_recordings, is_reversed
 from pipeline.ingest.columns import conversion, is_count
-from pipeline.results import Analysis
-from pipeline.submission import Experiment, InputScale, PositionScale, Reported, Submission, System
+from pipeline.names import read_name
+from pipeline.results import Analysis, ChainFit, Record
+from pipeline.submission import (
+    Experiment,
+    InputScale,
+    PositionScale,
+    Reported,
+    ReportedFeedback,
+    ReportedStateSpace,
+    Submission,
+    System,
+)
+from pipeline.submission.load import spring_names
 from pipeline.words.progress import Progress, silent
 from pipeline.workflow import analyse
 
@@ -320,3 +334,97 @@ def _flags(context: GradingContext) -> tuple[list[Flag], Array | None]:
     if problems := context.problems:
         flags.append(data_flag(problems))
     return flags, meant
+
+
+_NOTE = (
+    "a positive input drives these carts towards negative x, so reported values with the opposite "
+    "sign are read with the input reversed"
+)
+
+
+def accept_reversed_signs(
+    reported: Reported, records: Sequence[Record]
+) -> tuple[Reported, tuple[str, ...]]:
+    """Return the numbers as reported on a bench that is not reversed, and a note if any changed.
+
+    On a reversed bench, gains, B and the controller have the opposite sign in the log. Students may
+    report them with this sign or as positive numbers; both are right.
+    """
+    if not is_reversed(records):
+        return reported, ()
+    turned = reported.model_copy(
+        update={
+            "initial": _gains(reported.initial),
+            "final": _gains(reported.final),
+            "state_space": _space(reported.state_space),
+            "feedback": _feedback(reported.feedback),
+        }
+    )
+    return turned, () if turned == reported else (_NOTE,)
+
+
+def _gains(table: Mapping[str, Decimal]) -> dict[str, Decimal]:
+    gains = {name: -value for name, value in table.items() if read_name(name).is_gain}
+    return {**table, **gains} if gains and min(gains.values()) > 0 else dict(table)
+
+
+def _space(space: ReportedStateSpace | None) -> ReportedStateSpace | None:
+    if space is None or not any(space.B) or max(space.B) > 0:
+        return space
+    return space.model_copy(update={"B": tuple(-b if b else b for b in space.B)})
+
+
+def _feedback(feedback: ReportedFeedback | None) -> ReportedFeedback | None:
+    if feedback is None or feedback.prefilter is None or feedback.prefilter >= 0:
+        return feedback
+    gains = tuple(-gain for gain in feedback.gains)
+    return feedback.model_copy(update={"gains": gains, "prefilter": -feedback.prefilter})
+
+
+def with_all_springs(
+    submission: Submission,
+    analysis: Analysis,
+    *,
+    progress: Progress = silent,
+) -> tuple[Analysis, tuple[str, ...]]:
+    """Return the analysis with all springs, and the names of added springs, if the data need them.
+
+    Otherwise, the analysis is returned unchanged. All springs are tried at once, because a spring
+    that does not exist is fitted with zero stiffness. So no other set of springs can explain more.
+    On a single cart, nothing is tried, because only the sum of the springs matters.
+    """
+    fit, springs = analysis.fit, submission.system.springs
+    if analysis.bench.n == 1 or all(springs) or (fit is not None and is_explained(analysis)):
+        return analysis, ()
+    system = submission.system.model_copy(update={"springs": (True,) * len(springs)})
+    try:
+        other = analyse(
+            submission.model_copy(update={"system": system}), design=False, progress=progress
+        )
+    except PipelineError:
+        return analysis, ()
+    if other.fit is None or not (
+        is_explained(other)
+        or (
+            # Friction and similar effects increase χ² with any springs. Only a missing spring makes
+            # it many times larger.
+            fit is not None
+            and fit.method == other.fit.method
+            and fit.chi_square_per_dof > 10 * other.fit.chi_square_per_dof
+            and is_followed(other)
+        )
+    ):
+        return analysis, ()
+    names = zip(spring_names(analysis.bench.n), springs, _certain(other.fit), strict=True)
+    return other, tuple(name for name, asked, there in names if there and not asked)
+
+
+def _certain(fit: ChainFit) -> list[bool]:
+    """Return for each spring whether it certainly exists, even if the fit is not perfect."""
+    wider = max(1.0, fit.chi_square_per_dof) ** 0.5
+    std = dict(zip(fit.names, wider * np.sqrt(np.diag(fit.covariance)), strict=True))
+    k = fit.chain.k
+    # A spring fitted at zero has no standard error. The limits are high (ten standard errors, and a
+    # share of the stiffest spring), because a delay or friction looks like a weak spring.
+    least = [max(10 * std.get(f"k_{j + 1}", np.inf), 0.02 * k.max()) for j in range(k.size)]
+    return [bool(stiffness > limit) for stiffness, limit in zip(k, least, strict=True)]

@@ -12,8 +12,8 @@ from pipeline.grading import limits
 from pipeline.grading.grade import Code
 from pipeline.grading.mistakes.factors import FACTORS, LOG10, TURN, Factor, Of
 from pipeline.grading.mistakes.step_turns import StepTurns, step_turns
-from pipeline.grading.references.reference import Reference, is_explained
-from pipeline.grading.references.tolerance import as_typed
+from pipeline.grading.reference import Reference, is_explained
+from pipeline.grading.tolerance import as_typed
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.results import Analysis

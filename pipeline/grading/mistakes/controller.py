@@ -17,8 +17,8 @@ from pipeline.grading import limits
 from pipeline.grading.grade import Flag
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers, loop_numbers
 from pipeline.grading.mistakes.state_model import Order, own_chain
-from pipeline.grading.references.reference import is_explained
-from pipeline.grading.references.tolerance import as_typed, rounding
+from pipeline.grading.reference import is_explained
+from pipeline.grading.tolerance import as_typed, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain

@@ -9,8 +9,8 @@ from typing import Literal
 from pipeline.grading import limits
 from pipeline.grading.grade import Code
 from pipeline.grading.mistakes.catalogue import ExplanationKey, Mistake
-from pipeline.grading.references.reference import Reference
-from pipeline.grading.references.tolerance import Typed
+from pipeline.grading.reference import Reference
+from pipeline.grading.tolerance import Typed
 from pipeline.names import read_name
 
 _SLIP, _KNOWN_SLIP = math.log(limits.ONE_IN_OFF), math.log(limits.ONE_IN_KNOWN)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 
 from pipeline.grading.grade import Flag
-from pipeline.grading.references.tolerance import as_typed, rounding
+from pipeline.grading.tolerance import as_typed, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.plant.identities import parameter_orders

@@ -5,8 +5,8 @@ from fractions import Fraction
 from math import exp
 
 from pipeline.grading import limits
-from pipeline.grading.references.reference import Reference, References
-from pipeline.grading.references.tolerance import half_digit, is_vague, percent_off, rounding
+from pipeline.grading.reference import Reference, References
+from pipeline.grading.tolerance import half_digit, is_vague, percent_off, rounding
 from pipeline.names import read_name
 from pipeline.submission import Reported
 

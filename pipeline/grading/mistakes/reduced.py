@@ -13,7 +13,7 @@ from pipeline.arrays import Array
 from pipeline.grading import limits
 from pipeline.grading.grade import Code, Flag
 from pipeline.grading.mistakes.factors import FACTORS, MISREAD_RATIO
-from pipeline.grading.references.reference import is_explained
+from pipeline.grading.reference import is_explained
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.results import Analysis, SinePoint

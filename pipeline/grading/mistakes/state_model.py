@@ -13,8 +13,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.grading import limits
 from pipeline.grading.grade import Flag
-from pipeline.grading.references.reference import Reference
-from pipeline.grading.references.tolerance import percent_off
+from pipeline.grading.reference import Reference
+from pipeline.grading.tolerance import percent_off
 from pipeline.grading.words import WORDS
 from pipeline.names import parameter_names, read_name
 from pipeline.plant.chain import Chain

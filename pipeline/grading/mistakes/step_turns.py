@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.grading.references.reference import Reference
+from pipeline.grading.reference import Reference
 from pipeline.names import read_name
 from pipeline.results import Analysis, Record, StepGain
 

@@ -6,8 +6,8 @@ from decimal import Decimal
 from pipeline.grading import limits
 from pipeline.grading.grade import CODES, Code, Flag
 from pipeline.grading.mistakes.explain import ExplainedNumbers, Label, Table
-from pipeline.grading.references.reference import Reference, References
-from pipeline.grading.references.tolerance import as_typed, percent_off
+from pipeline.grading.reference import Reference, References
+from pipeline.grading.tolerance import as_typed, percent_off
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.submission import Reported

@@ -20,8 +20,8 @@ from pipeline.grading.mistakes.table_flags import (
 )
 from pipeline.grading.mistakes.transient import transient_fits
 from pipeline.grading.mistakes.undo import Slip, Slipped, undo
-from pipeline.grading.references.reference import Reference, References, is_linear
-from pipeline.grading.references.tolerance import percent_off
+from pipeline.grading.reference import Reference, References, is_linear
+from pipeline.grading.tolerance import percent_off
 from pipeline.names import read_name
 from pipeline.results import Analysis
 from pipeline.submission import Reported

@@ -10,7 +10,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.bode_fit import fit_bode
 from pipeline.grading import limits
 from pipeline.grading.mistakes.catalogue import Mistake
-from pipeline.grading.references.reference import Reference
+from pipeline.grading.reference import Reference
 from pipeline.names import read_name
 from pipeline.results import Analysis, FrequencyResponse, Record
 

@@ -7,8 +7,8 @@ from fractions import Fraction
 from functools import cached_property
 
 from pipeline.grading.grade import Code
-from pipeline.grading.references.reference import Reference
-from pipeline.grading.references.tolerance import as_typed, percent_off, rounding
+from pipeline.grading.reference import Reference
+from pipeline.grading.tolerance import as_typed, percent_off, rounding
 from pipeline.names import read_name
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from pipeline import __version__
 from pipeline.grading.grade import CODES, Code
 from pipeline.grading.gradebook.class_lines import GradeSummary, class_frame, wrong_springs
-from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import Cluster
 from pipeline.grading.similarity.distant import Distant
 from pipeline.grading.similarity.repeated_authors import RepeatedAuthors
+from pipeline.grading.tolerance import exact
 from pipeline.grading.words import WORDS, on_one_line, points_text, signed_points
 from pipeline.report.builder import PageBuilder, Part
 from pipeline.report.document import (

@@ -12,9 +12,9 @@ from pathlib import Path
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradescope import results_text
 from pipeline.grading.platforms import PLATFORMS, Platform
 from pipeline.grading.publish.feedback import feedback_page
-from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.publish.roster import Roster
 from pipeline.grading.publish.students import Remark, Student, about, not_exported, students_of
 from pipeline.grading.publish.view import GradeView, view

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import ConfigError
 from pipeline.grading import rubric as asked
-from pipeline.grading.references.reference import in_doubt, recompute
+from pipeline.grading.reference import in_doubt, recompute
 from pipeline.grading.rubric import Rubric, matching
 from pipeline.grading.rubric_file import shipped_rubric
 from pipeline.json_files import (

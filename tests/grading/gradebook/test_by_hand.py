@@ -14,11 +14,11 @@ from pipeline.grading.gradebook.decisions import Conflict, points_lost
 from pipeline.grading.gradebook.events import TOTAL
 from pipeline.grading.gradebook.history import history_text
 from pipeline.grading.gradebook.override import read_wishes
+from pipeline.grading.gradescope import results_text
 from pipeline.grading.judge.recompute import findings_text, read_findings, recompute_points
 from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.export import export
-from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.publish.view import new_view
 from pipeline.grading.rubric import Manual, Rubric

@@ -16,7 +16,7 @@ from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.events import POINTS, TOTAL, Event
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.override import WantedPoints
-from pipeline.grading.references.tolerance import with_total
+from pipeline.grading.tolerance import with_total
 from tests.helpers.grades import book_of, make_grade, two_cart_rubric
 
 RUBRIC = two_cart_rubric()

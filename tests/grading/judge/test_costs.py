@@ -13,8 +13,8 @@ from pipeline.grading.mistakes.state_model import (
     model_harm,
     order_names,
 )
-from pipeline.grading.references.tolerance import exact, late_deduction, to_step
 from pipeline.grading.rubric import Late
+from pipeline.grading.tolerance import exact, late_deduction, to_step
 from pipeline.plant.chain import PRESETS
 from pipeline.submission import ReportedStateSpace
 from tests.helpers.grading_students import Student, criterion, student, typed

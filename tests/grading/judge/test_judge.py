@@ -15,10 +15,9 @@ import pytest
 
 from pipeline.grading.grade import CODES, Flag, Grade, grade_text
 from pipeline.grading.judge.checks import between
-from pipeline.grading.judge.run import grade_submission, under_rubric
+from pipeline.grading.judge.run import grade_submission, under_rubric, with_all_springs
 from pipeline.grading.mistakes.state_model import StateMatrices, compare_entries
 from pipeline.grading.mistakes.undo import Number
-from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.simulated.submission import write_submission

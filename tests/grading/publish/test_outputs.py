@@ -19,10 +19,10 @@ from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import CODES, Adjustment, Flag, Grade
 from pipeline.grading.gradebook.class_lines import GradeSummary
 from pipeline.grading.gradebook.override import Event, read_points, with_overrides
+from pipeline.grading.gradescope import results_text
 from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import evidence_table, feedback_page, numbers_table
-from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
 from pipeline.grading.publish.view import new_view
 from pipeline.grading.words import WORDS

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.grading.references.reference import recompute
+from pipeline.grading.reference import recompute
 from pipeline.results import Analysis
 from tests.helpers.grading_students import student
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.grading.references.reference import Reference
-from pipeline.grading.references.tolerance import (
+from pipeline.grading.reference import Reference
+from pipeline.grading.tolerance import (
     as_typed,
     credit,
     half_digit,

@@ -17,13 +17,12 @@ from typing import Any
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.autograder import run
-from pipeline.grading.autograder.pack import write_autograder
-from pipeline.grading.autograder.pins import pin_requirements
+from pipeline.grading import gradescope
 from pipeline.grading.batch.runner import Grader
 from pipeline.grading.batch.task import Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import Grade, read_grade
+from pipeline.grading.gradescope import pin_requirements, write_autograder
 from pipeline.grading.gradings import Grading
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
@@ -114,7 +113,7 @@ def upload_here(root: Path, submission: Path, *, rubric: str = "") -> dict[str, 
     (root / "results").mkdir()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Grader, "run", grade)
-        assert run.grade_upload(root) == ""
+        assert gradescope.grade_upload(root) == ""
     return read_results(root)
 
 
@@ -299,8 +298,8 @@ def test_a_grading_that_takes_too_long_is_stopped(root, team, monkeypatch):
     """
     put(root, team)
     (root / "results").mkdir()
-    monkeypatch.setattr(run, "_TIME_LIMIT", 0.0)
-    run.grade_upload(root)
+    monkeypatch.setattr(gradescope, "_TIME_LIMIT", 0.0)
+    gradescope.grade_upload(root)
     results = read_results(root)
     assert results["score"] == 0.0
     assert "0 s" in results["output"]

@@ -1,6 +1,8 @@
 """The error of a number and the points it earns.
 
-The arithmetic is exact, so that a number exactly at a limit is judged correctly.
+The arithmetic is exact, so that a number exactly at a limit is judged correctly. Only this file
+reads the tolerances of a criterion. So `judge/recompute.py` can apply another rubric to stored
+errors, with the same result as grading again.
 """
 
 import math
@@ -15,7 +17,11 @@ from pipeline.grading.grade import Criterion, Grade
 from pipeline.grading.rubric import Late, Rubric
 
 if TYPE_CHECKING:
-    from pipeline.grading.references.reference import Reference
+    from pipeline.grading.reference import Reference
+from collections.abc import Mapping
+from typing import Literal
+
+from pipeline.grading import rubric as asked
 
 Number = TypeVar("Number", float, Fraction)
 
@@ -170,3 +176,60 @@ def late_deduction(earned: Fraction, *, late: Late, step: float, days_late: floa
     days = max(0, math.ceil(days_late - late.grace_days))
     share = min(exact(late.percent_per_day) * days, exact(late.most_percent)) / 100
     return -to_step(-earned * share, step)
+
+
+ALL, NONE = Fraction(1), Fraction(0)  # shares of the points
+Tolerance = Literal["number", "exact", "damping", "overshoot", "settling"]
+# For each tolerance, two keys of a criterion: the largest error with full points, and the smallest
+# error without points.
+TOLERANCES: Mapping[Tolerance, tuple[str, str]] = {
+    "number": ("full_percent", "none_percent"),
+    "exact": ("full_percent", "none_percent"),
+    "damping": ("damping_full_percent", "damping_none_percent"),
+    "overshoot": ("overshoot_full", "overshoot_none"),
+    "settling": ("settling_full_percent", "settling_none_percent"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deviation:
+    """The error of a number, and the tolerance that judges it.
+
+    Attributes
+    ----------
+    error : the error in percent, or in percentage points for an overshoot.
+    by : name of the tolerance. `exact` is for an entry of a state model that must be 0 or 1. A
+        right 0 or 1 is ignored, because it is no achievement.
+    """
+
+    error: Fraction
+    by: Tolerance = "number"
+
+
+def points_for_one(criterion: asked.Criterion, deviation: Deviation) -> Fraction:
+    """Return the share of the criterion's points that one number earns."""
+    full, none = (getattr(criterion, key) for key in TOLERANCES[deviation.by])
+    return credit(deviation.error, full=full, none=none)
+
+
+def points_for(criterion: asked.Criterion, deviations: Sequence[Deviation]) -> Fraction:
+    """Return the share of the criterion's points that one or more numbers earn together.
+
+    Gains must meet the whole goal, so the worst number counts. In other criteria, all numbers count
+    equally.
+    """
+    shares = [points_for_one(criterion, deviation) for deviation in deviations]
+    if isinstance(criterion, asked.Gains):
+        return min(shares)
+    return mean_share(
+        [
+            share
+            for share, deviation in zip(shares, deviations, strict=True)
+            if deviation.by != "exact" or share < 1
+        ]
+    )
+
+
+def mean_share(shares: Sequence[Fraction]) -> Fraction:
+    """Return the mean of shares; needs at least one."""
+    return sum(shares, NONE) / len(shares)

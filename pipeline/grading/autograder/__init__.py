@@ -1,1 +1,0 @@
-"""Make Gradescope grade each submission with cartlab when a student uploads it."""

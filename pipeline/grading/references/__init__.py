@@ -1,1 +1,0 @@
-"""The values of parameters that the recordings give, with bounds and tolerances."""
