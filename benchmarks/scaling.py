@@ -24,9 +24,8 @@ import numpy as np
 from benchmarks.copies import disguised
 from benchmarks.grading_batch import grade, write_class
 from benchmarks.page import significant
-from pipeline.grading.batch.task import Task
 from pipeline.grading.batch.worker import grade_task
-from pipeline.grading.gradings import Member
+from pipeline.grading.gradings import Member, Task
 from pipeline.grading.intake.files import packed
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.copies import find_copies

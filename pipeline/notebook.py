@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import ConfigError, DataError
 from pipeline.gap.types import Gap
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.self_check.answers import CheckAnswer, answer_lines
 from pipeline.grading.self_check.check import check_numbers
-from pipeline.grading.self_check.log import CheckAnswer
-from pipeline.grading.self_check.words import answer_lines
 from pipeline.plant.chain import Chain
 from pipeline.plant.margins import closed_loop
 from pipeline.plant.motion import EquationsOfMotion

@@ -5,7 +5,7 @@ import json
 from pipeline.errors import ConfigError
 from pipeline.gap.types import Gap
 from pipeline.grading.grade import Grade
-from pipeline.grading.self_check.log import CheckAnswer
+from pipeline.grading.self_check.answers import CheckAnswer
 from pipeline.json_files import json_schema
 from pipeline.report.solution.expected import Solution
 from pipeline.results import Analysis

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SubmissionError
-from pipeline.grading.self_check.log import read_answers
+from pipeline.grading.self_check.answers import read_answers
 from pipeline.notebook import check
 from pipeline.resources import RUBRICS
 from pipeline.simulated.submission import write_submission

@@ -239,9 +239,8 @@ def check(
     The right value is never shown. DIR/checks.jsonl, part of your submission, counts the checks.
     """
     from pipeline.grading.rubric_file import load_rubric
+    from pipeline.grading.self_check.answers import answer_line, answer_lines
     from pipeline.grading.self_check.check import check_numbers
-    from pipeline.grading.self_check.log import answer_line
-    from pipeline.grading.self_check.words import answer_lines
     from pipeline.submission import load_submission
 
     asked = load_rubric(rubric) if rubric else None

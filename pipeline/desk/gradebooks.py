@@ -11,7 +11,7 @@ from typing import Any
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.class_lines import ClassNow, ClassRow
 from pipeline.grading.gradebook.gradebook import Gradebook, State
-from pipeline.grading.publish.anonymous import anonymous_line, pseudonyms
+from pipeline.grading.publish.view import anonymous_line, pseudonyms
 from pipeline.grading.rubric import Rubric
 
 

@@ -25,8 +25,8 @@ from packaging.version import Version
 import pipeline
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.runner import Grader
-from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.grade import Criterion, Grade, read_grade
+from pipeline.grading.gradings import Setup, Task
 from pipeline.grading.publish.view import GradeView, new_view
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import find_rubric, load_rubric, parse_rubric, rubric_source

@@ -11,7 +11,7 @@ from pipeline.desk.app import ROUTES
 from pipeline.desk.student.handin import list_held, list_missing
 from pipeline.desk.users import read_users
 from pipeline.errors import ConfigError
-from pipeline.grading.self_check.log import FILE, read_answers
+from pipeline.grading.self_check.answers import FILE, read_answers
 from pipeline.resources import RUBRICS
 from pipeline.submission import load_submission
 from tests.helpers.commandline import cartlab_here

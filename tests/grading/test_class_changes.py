@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch.class_changes import find_class_changes
 from pipeline.grading.batch.grade_class import Options, grade_class
-from pipeline.grading.batch.task import Setup, Task
+from pipeline.grading.batch.runner import find_class_changes
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Grading
+from pipeline.grading.gradings import Grading, Setup, Task
 from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.resources import RUBRICS

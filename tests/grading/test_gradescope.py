@@ -19,11 +19,10 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading import gradescope
 from pipeline.grading.batch.runner import Grader
-from pipeline.grading.batch.task import Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import Grade, read_grade
 from pipeline.grading.gradescope import pin_requirements, write_autograder
-from pipeline.grading.gradings import Grading
+from pipeline.grading.gradings import Grading, Task
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
 from tests.helpers.commandline import cartlab_here

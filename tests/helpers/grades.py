@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
 from pipeline.grading.gradebook.database import FILE
 from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.events import Request
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Batch, Grading
+from pipeline.grading.gradings import Batch, Grading, Setup, Task
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric

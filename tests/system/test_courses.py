@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.self_check.log import read_answers
+from pipeline.grading.self_check.answers import read_answers
 from pipeline.simulated.submission import write_submission
 from tests.helpers.places import ROOT
 from tests.helpers.waiting import PATIENCE

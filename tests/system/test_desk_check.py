@@ -6,7 +6,7 @@ import pytest
 from playwright.sync_api import expect
 
 from pipeline.desk.app import DeskServer
-from pipeline.grading.self_check.log import read_answers
+from pipeline.grading.self_check.answers import read_answers
 from tests.helpers.desks import a_submission
 from tests.system import test_desk
 from tests.system.test_report_pages import PHONE

@@ -14,10 +14,9 @@ from pipeline.errors import ConfigError
 from pipeline.experiments.plan import load_plan, plan_path, plan_text
 from pipeline.experiments.propose import propose_plan
 from pipeline.gap.types import read_gap
-from pipeline.grading.intake.late_table import read_late_table
+from pipeline.grading.intake.find import read_late_table
 from pipeline.grading.platforms import PLATFORMS, gradescope_metadata
-from pipeline.grading.publish.roster import Roster
-from pipeline.grading.publish.students import Student
+from pipeline.grading.publish.roster import Roster, Student
 from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
 from pipeline.grading.publish.view import new_view
 from pipeline.grading.rubric_file import load_rubric

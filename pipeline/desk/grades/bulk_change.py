@@ -17,8 +17,8 @@ from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.decisions import Conflict
 from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.override import WantedPoints, read_points
-from pipeline.grading.publish.anonymous import STRANGER
 from pipeline.grading.publish.feedback import sentence
+from pipeline.grading.publish.view import STRANGER
 from pipeline.grading.rubric import Criterion
 from pipeline.grading.words import WORDS, points_text
 from pipeline.words.numbers import count

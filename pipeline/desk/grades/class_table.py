@@ -21,11 +21,10 @@ from pipeline.grading.gradebook.events import TOTAL
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import to_the_second
 from pipeline.grading.platforms import PLATFORMS
-from pipeline.grading.publish.anonymous import STRANGER
 from pipeline.grading.publish.class_page import class_page, not_final
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.outputs import repeated_authors_of
-from pipeline.grading.publish.view import view
+from pipeline.grading.publish.view import STRANGER, view
 from pipeline.grading.similarity.clusters import find_clusters, renamed
 from pipeline.grading.similarity.distant import find_distant, recomputed_numbers
 from pipeline.grading.words import WORDS, points_text, signed_points

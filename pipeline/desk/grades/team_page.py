@@ -49,9 +49,8 @@ from pipeline.grading.intake.repairs import (
     text_key,
 )
 from pipeline.grading.judge.remarks import find_remarks
-from pipeline.grading.publish.anonymous import renamed_events
 from pipeline.grading.publish.class_page import feedback_link
-from pipeline.grading.publish.view import view
+from pipeline.grading.publish.view import renamed_events, view
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.report.html import render_drawing

@@ -7,8 +7,15 @@ from typing import Any
 
 from pipeline.desk.student.steps import Status
 from pipeline.errors import SubmissionError
-from pipeline.grading.self_check.log import CheckAnswer, find_basis, read_answers
-from pipeline.grading.self_check.words import asked_words, hint_words, number_words, result_words
+from pipeline.grading.self_check.answers import (
+    CheckAnswer,
+    asked_words,
+    find_basis,
+    hint_words,
+    number_words,
+    read_answers,
+    result_words,
+)
 from pipeline.submission import Submission, load_submission
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.desk.last_report import NOTES, find_state
 from pipeline.errors import SubmissionError
-from pipeline.grading.self_check.log import FILE as CHECKS
+from pipeline.grading.self_check.answers import FILE as CHECKS
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME, file_problem
 

@@ -17,8 +17,7 @@ from distributed.worker import Worker as DaskWorker
 
 from pipeline.errors import ConfigError, is_disk_full
 from pipeline.grading.batch.runner import Executor, Grader, code_version
-from pipeline.grading.batch.task import Setup, Task, failed
-from pipeline.grading.gradings import Grading
+from pipeline.grading.gradings import Grading, Setup, Task, failed
 from pipeline.grading.intake.files import packed, unpacked
 
 _CONNECT_LIMIT = 20  # s

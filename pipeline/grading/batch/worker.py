@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import PipelineError, is_disk_full
-from pipeline.grading.batch.task import OUT_OF_MEMORY, Task, failed, plain_grading
 from pipeline.grading.grade import grade_text
-from pipeline.grading.gradings import Grading
+from pipeline.grading.gradings import OUT_OF_MEMORY, Grading, Task, failed, plain_grading
 from pipeline.grading.intake.files import Changed, open_submission
 from pipeline.grading.intake.repairs import Repair, text_key
 from pipeline.grading.judge.recompute import findings_text
 from pipeline.grading.judge.run import Graded, grade_submission
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.self_check.words import asked_note
+from pipeline.grading.self_check.answers import asked_note
 from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.ingest.files import OF_STRANGERS
 from pipeline.processes import serve

@@ -15,8 +15,14 @@ from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradescope import results_text
 from pipeline.grading.platforms import PLATFORMS, Platform
 from pipeline.grading.publish.feedback import feedback_page
-from pipeline.grading.publish.roster import Roster
-from pipeline.grading.publish.students import Remark, Student, about, not_exported, students_of
+from pipeline.grading.publish.roster import (
+    Remark,
+    Roster,
+    Student,
+    about,
+    not_exported,
+    students_of,
+)
 from pipeline.grading.publish.view import GradeView, view
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import WORDS, on_one_line, person_lines, points_text, waiting_text

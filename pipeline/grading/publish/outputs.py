@@ -13,10 +13,9 @@ from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, grade_text
 from pipeline.grading.gradebook.class_lines import GradeSummary
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.publish.anonymous import KEY_FILE, STRANGER, key_text, pseudonyms
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import feedback_page
-from pipeline.grading.publish.view import view
+from pipeline.grading.publish.view import KEY_FILE, STRANGER, key_text, pseudonyms, view
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.clusters import find_clusters, renamed
 from pipeline.grading.similarity.distant import Quantity, find_distant, recomputed_numbers

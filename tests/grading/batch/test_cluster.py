@@ -11,8 +11,8 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.cluster import run_on
 from pipeline.grading.batch.runner import grade_batch, run_here
-from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradings import Setup, Task
 from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.rubric_file import load_rubric
 from tests.helpers.grading_students import write_team

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.batch.task import Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradings import Task
 from pipeline.grading.intake.unpack import HAND_IN, unpack
 from pipeline.grading.rubric_file import load_rubric
 from tests.helpers.grading_students import copy_step, write_team
@@ -105,7 +105,7 @@ def test_a_file_with_an_impossible_name_is_refused_for_good(tmp_path):
 _STARVED = """
 import json, resource, sys
 from pathlib import Path
-from pipeline.grading.batch.task import Task
+from pipeline.grading.gradings import Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.rubric_file import load_rubric
 

@@ -16,17 +16,16 @@ import numpy as np
 import pytest
 
 from pipeline.grading.batch.runner import Grader, code_version, grade_batch, run_here
-from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.batch.worker import grade_task, named_authors, read_authors
 from pipeline.grading.grade import grade_text, read_grade
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Example
+from pipeline.grading.gradings import Example, Setup, Task
 from pipeline.grading.intake.files import digest, packed, unpacked
 from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish import feedback_figures
 from pipeline.grading.publish.outputs import write_outputs
-from pipeline.grading.publish.students import students_of
+from pipeline.grading.publish.roster import students_of
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.ingest.read import read_data

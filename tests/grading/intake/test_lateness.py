@@ -5,8 +5,7 @@ from datetime import datetime
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.intake.find import HandIn
-from pipeline.grading.intake.late_table import read_late_table, settle_lateness
+from pipeline.grading.intake.find import HandIn, read_late_table, settle_lateness
 from pipeline.grading.rubric import Late
 
 DUE = datetime.fromisoformat("2026-11-20T23:59:00-08:00")

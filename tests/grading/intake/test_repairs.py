@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch.task import Task
 from pipeline.grading.batch.worker import grade_task
-from pipeline.grading.gradings import Grading
+from pipeline.grading.gradings import Grading, Task
 from pipeline.grading.intake.repairs import (
     FOLDER,
     Repair,

@@ -12,7 +12,7 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.export import export
-from pipeline.grading.publish.students import students_of
+from pipeline.grading.publish.roster import students_of
 from tests.helpers.grades import (
     book_of,
     failed_grade,

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.grading.batch.runner import grade_batch
-from pipeline.grading.batch.task import Setup
 from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradings import Setup
 from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.publish.rubric_preview import preview_rubric
 from pipeline.grading.rubric import Rubric

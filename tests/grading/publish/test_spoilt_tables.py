@@ -10,10 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
-from pipeline.grading.intake.late_table import read_late_table
+from pipeline.grading.intake.find import read_late_table
 from pipeline.grading.platforms import PLATFORMS
-from pipeline.grading.publish.roster import Roster
-from pipeline.grading.publish.students import Student
+from pipeline.grading.publish.roster import Roster, Student
 from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
 from pipeline.grading.publish.view import new_view
 from tests.helpers.grades import make_grade, two_cart_rubric

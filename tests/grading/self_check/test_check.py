@@ -6,9 +6,8 @@ from functools import cache
 
 import pytest
 
+from pipeline.grading.self_check.answers import CheckAnswer, answer_line, answer_lines
 from pipeline.grading.self_check.check import JudgedNumbers, judge_numbers, next_answer
-from pipeline.grading.self_check.log import CheckAnswer, answer_line
-from pipeline.grading.self_check.words import answer_lines
 from tests.helpers.grading_class import Team, make_team
 from tests.helpers.grading_slips import OF_SEVERAL_CARTS, SLIPS, reporting, scaled
 

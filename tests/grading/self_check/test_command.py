@@ -7,11 +7,11 @@ import sys
 import jsonschema
 import pytest
 
-from pipeline.grading.batch.task import Task
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import read_grade
+from pipeline.grading.gradings import Task
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.grading.self_check.log import FILE, read_answers
+from pipeline.grading.self_check.answers import FILE, read_answers
 from pipeline.resources import RUBRICS
 from tests.helpers.commandline import Done, cartlab_here
 from tests.helpers.desks import a_submission

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from pipeline.grading.batch.runner import grade_batch
-from pipeline.grading.batch.task import Setup
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Example, Member
+from pipeline.grading.gradings import Example, Member, Setup
 from pipeline.grading.intake.find import find_hand_ins
-from pipeline.grading.publish.anonymous import anonymise
+from pipeline.grading.publish.view import anonymise
 from pipeline.grading.similarity.clusters import find_clusters
 from pipeline.grading.similarity.copies import SharedRecord
 from pipeline.grading.similarity.flag import shared_flag, student_message
