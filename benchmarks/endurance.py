@@ -39,7 +39,7 @@ from benchmarks.page import machine
 from pipeline.experiments.plan import load_plan, session_time
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
-from pipeline.grading.judge.recompute import findings_text
+from pipeline.grading.judge.award import findings_text
 from pipeline.grading.judge.run import under_rubric
 from pipeline.grading.publish.feedback import draw_figures, draw_records
 from pipeline.grading.rubric import Rubric

@@ -196,7 +196,7 @@ def override(
     assignment: Lab = None,
 ) -> None:
     """Give criteria points by hand; every later grading keeps them."""
-    from pipeline.grading.gradebook.override import read_points
+    from pipeline.grading.gradebook.decisions import read_points
 
     if table is not None:
         if team or criterion or points:
@@ -220,7 +220,7 @@ def adjust(
     assignment: Lab = None,
 ) -> None:
     """Change a team's total, for a bonus or a penalty; every later grading keeps it."""
-    from pipeline.grading.gradebook.override import read_points
+    from pipeline.grading.gradebook.decisions import read_points
 
     _change(grades, team, assignment, lambda book, name: book.adjust(
         name, read_points(points) or 0.0, why=why, by=by))  # fmt: skip
@@ -248,7 +248,7 @@ def _override_from(grades: str, table: Path, *, why: str, by: str, assignment: s
     """Change points from a table, either all of them or none."""
     from dataclasses import replace
 
-    from pipeline.grading.gradebook.override import read_wishes
+    from pipeline.grading.gradebook.decisions import read_wishes
     from pipeline.grading.publish.view import resolve_pseudonym
     from pipeline.words.numbers import count
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from pipeline.grading.gradebook.events import Event, hide_people
+from pipeline.grading.gradebook.entry import Event, hide_people
 from pipeline.grading.gradebook.history import to_the_second
 from pipeline.grading.words import points_text
 

@@ -75,7 +75,7 @@ class Grading(Member):
     ----------
     settled : False if the next run must grade the submission again, for example after a crash.
     grade : text of `grade.json`, without the flag for shared data and without overrides.
-    findings : results of the checks, as `judge.recompute_points` stores them; "" if grading failed.
+    findings : results of the checks, from `judge.award.findings_text`; "" if grading failed.
     figures : file name and SVG text of each figure in the feedback.
     detail : for developers: the traceback of an error in the grader, or "".
     is_disk_full : whether the disk was full; the gradebook does not store this.

@@ -1,8 +1,8 @@
 """The error of a number and the points it earns.
 
 The arithmetic is exact, so that a number exactly at a limit is judged correctly. Only this file
-reads the tolerances of a criterion. So `judge/recompute.py` can apply another rubric to stored
-errors, with the same result as grading again.
+reads the tolerances of a criterion. So `judge.award` can apply another rubric to stored errors,
+with the same result as grading again.
 """
 
 import math

@@ -27,8 +27,8 @@ from itertools import count
 from sqlalchemy import Engine
 from sqlalchemy.event import listen
 
+from pipeline.grading.gradebook.decisions import WantedPoints
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.override import WantedPoints
 from pipeline.grading.gradings import Batch
 from tests.helpers.grades import (
     book_of,

@@ -13,8 +13,7 @@ import numpy as np
 from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
 from pipeline.grading.gradebook.database import FILE
-from pipeline.grading.gradebook.entry import Entry
-from pipeline.grading.gradebook.events import Request
+from pipeline.grading.gradebook.entry import Entry, Request
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch, Grading, Setup, Task
 from pipeline.grading.publish.outputs import write_outputs
@@ -173,7 +172,7 @@ def write_class_of_two(folder: Path, *, anonymous: bool = False) -> None:
 
     The gradebook has the findings of the checks, as after a real grading.
     """
-    from pipeline.grading.judge.recompute import findings_text
+    from pipeline.grading.judge.award import findings_text
     from tests.helpers.grading_students import student  # simulates a bench and analyses it
 
     honest = student(1)

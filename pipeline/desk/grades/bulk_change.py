@@ -14,9 +14,8 @@ from pipeline.desk.grades.filters import Filter
 from pipeline.desk.grades.team_page import sign, write_address
 from pipeline.desk.page_request import PageRequest
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.decisions import Conflict
+from pipeline.grading.gradebook.decisions import Conflict, WantedPoints, read_points
 from pipeline.grading.gradebook.entry import Entry
-from pipeline.grading.gradebook.override import WantedPoints, read_points
 from pipeline.grading.publish.feedback import sentence
 from pipeline.grading.publish.view import STRANGER
 from pipeline.grading.rubric import Criterion

@@ -15,7 +15,7 @@ from pipeline.desk.grades.team_page import sign
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.scratch import scratch_folder
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.override import read_wishes
+from pipeline.grading.gradebook.decisions import read_wishes
 from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.export import export, export_feedback
 from pipeline.output import zip_bytes

@@ -7,13 +7,11 @@ from typing import Any
 
 from pipeline.desk.evidence import show_message, show_numbers
 from pipeline.grading.grade import Criterion, Flag, Grade
-from pipeline.grading.gradebook.entry import Entry
-from pipeline.grading.gradebook.events import Event
-from pipeline.grading.judge.remarks import is_about
+from pipeline.grading.gradebook.entry import Entry, Event
 from pipeline.grading.publish.feedback import TONES, alternative, evidence_table, sentence
 from pipeline.grading.publish.feedback_figures import is_response, numbers_in
 from pipeline.grading.rubric import Criterion as Asked
-from pipeline.grading.rubric import Rubric
+from pipeline.grading.rubric import Rubric, is_about
 from pipeline.grading.tolerance import exact, to_step
 from pipeline.grading.words import WORDS, points_text
 from pipeline.names import read_name

@@ -13,10 +13,8 @@ from pipeline.desk.grades.team_page import sign
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.request_steps import describe_steps
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.decisions import MOST_LETTERS, Conflict, RequestRefused
-from pipeline.grading.gradebook.entry import Entry
-from pipeline.grading.gradebook.events import Request
-from pipeline.grading.gradebook.override import read_points
+from pipeline.grading.gradebook.decisions import MOST_LETTERS, Conflict, RequestRefused, read_points
+from pipeline.grading.gradebook.entry import Entry, Request
 from pipeline.grading.publish.feedback import sentence
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import points_text

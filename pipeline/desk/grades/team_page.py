@@ -35,11 +35,9 @@ from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.class_lines import ClassRow, slip_of
-from pipeline.grading.gradebook.decisions import Conflict
-from pipeline.grading.gradebook.entry import Entry
-from pipeline.grading.gradebook.events import TOTAL
+from pipeline.grading.gradebook.decisions import Conflict, read_points
+from pipeline.grading.gradebook.entry import TOTAL, Entry
 from pipeline.grading.gradebook.history import event_words, to_the_second
-from pipeline.grading.gradebook.override import read_points
 from pipeline.grading.intake.repairs import (
     Repair,
     read_original,
@@ -48,10 +46,9 @@ from pipeline.grading.intake.repairs import (
     save_repair,
     text_key,
 )
-from pipeline.grading.judge.remarks import find_remarks
 from pipeline.grading.publish.class_page import feedback_link
 from pipeline.grading.publish.view import renamed_events, view
-from pipeline.grading.rubric import Rubric
+from pipeline.grading.rubric import Rubric, find_remarks
 from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.report.html import render_drawing
 from pipeline.words.text import capital

@@ -14,7 +14,7 @@ from pipeline.grading.grade import grade_text
 from pipeline.grading.gradings import OUT_OF_MEMORY, Grading, Task, failed, plain_grading
 from pipeline.grading.intake.files import Changed, open_submission
 from pipeline.grading.intake.repairs import Repair, text_key
-from pipeline.grading.judge.recompute import findings_text
+from pipeline.grading.judge.award import findings_text
 from pipeline.grading.judge.run import Graded, grade_submission
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.self_check.answers import asked_note

@@ -1,17 +1,135 @@
-"""Decisions about a submission: each function checks one and returns the events to store."""
+"""What people want to change: tables of changes, and decisions about a submission.
+
+Each function about a decision checks it and returns the events to store.
+"""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from math import floor
+from pathlib import Path
 
 from pipeline.errors import ConfigError
+from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.entry import Entry
-from pipeline.grading.gradebook.events import TOTAL, Event
-from pipeline.grading.gradebook.override import WantedPoints, check_step
+from pipeline.grading.gradebook.entry import TOTAL, Entry, Event
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.tolerance import exact
 from pipeline.grading.words import points_text
 from pipeline.submission.toml import nearest
 from pipeline.words.text import clean
+
+_HEADS = ("submission", "criterion", "points", "why")  # columns of a table of requested changes
+
+
+def read_points(text: str) -> float | None:
+    """Return the points that a person typed, or None for "auto".
+
+    Raises
+    ------
+    ConfigError : the text is neither points nor "auto".
+    """
+    if text.strip().casefold() == "auto":
+        return None
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        raise ConfigError(f"{text}: expected a number of points, or auto") from None
+
+
+def check_step(points: float, *, out_of: float, step: float) -> None:
+    """Refuse points that are not a multiple of the rubric's step; all points are always allowed.
+
+    Raises
+    ------
+    ConfigError : the message names the nearest points that are allowed.
+    """
+    steps = exact(points) / exact(step)
+    if steps.denominator == 1 or points == out_of:
+        return
+    below = floor(steps) * exact(step)
+    above = min(below + exact(step), exact(out_of))
+    raise ConfigError(
+        f"{points:g} points are not a multiple of the rubric's step, {step:g}: "
+        f"give {float(below):g} or {float(above):g}"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class WantedPoints:
+    """A change that a person requests: points or a comment for one criterion of a submission.
+
+    Attributes
+    ----------
+    points : requested points; None for the automatic points.
+    comment : whether `why` is only a comment for the team.
+    line : line number in the table that requests the change; 0 without a table.
+    version : version of the points that the person saw, from `Entry.version`; "" to change any.
+    """
+
+    submission: str
+    criterion: str
+    points: float | None
+    why: str
+    comment: bool = False
+    line: int = 0
+    version: str = ""
+
+
+def read_wishes(path: Path, *, why: str = "") -> list[WantedPoints]:
+    """Read requested changes from a CSV file of one of two forms.
+
+    Either each row is a change, with the columns submission, criterion, points and why; or each row
+    is a submission, with a column for each criterion, in which an empty cell changes nothing. The
+    column why is optional if `why` is given. The word "auto" stands for the automatic points.
+
+    Parameters
+    ----------
+    why : the reason for changes without a reason of their own.
+
+    Raises
+    ------
+    ConfigError : the table is not valid; the message names the line.
+    """
+    table = read_table(path, exact=True)
+    by_row = {"criterion", "points"} <= set(table.columns)
+    needed = [name for name in (_HEADS if by_row else ("submission", "why"))
+              if name != "why" or not why]  # fmt: skip
+    missing = [name for name in needed if name not in table.columns]
+    if missing or not table.columns.is_unique:
+        form = _HEADS if by_row else ("submission", "why", "one for each criterion")
+        raise ConfigError(
+            f"{path.name}: needs the columns {', '.join(form)}, each once"
+            + (f"; it lacks {', '.join(missing)}" if missing else "")
+        )
+    criteria = [name for name in table.columns if name and name not in _HEADS]
+    wishes: list[WantedPoints] = []
+    seen: dict[tuple[str, str], int] = {}
+    for line, row in table.iterrows():
+        cells = {str(name): str(cell).strip() for name, cell in row.items()}
+        asked = {name: cells[name] for name in criteria if cells[name]}
+        if by_row:
+            asked = {cells["criterion"]: cells["points"]}
+        for criterion, points in asked.items():
+            try:
+                given = read_points(points)
+            except ConfigError as error:
+                at = "" if by_row else f", column {criterion}"
+                raise ConfigError(f"{path.name} line {line}{at}: {error}") from None
+            first = seen.setdefault((cells["submission"], criterion), int(str(line)))
+            if first != int(str(line)):
+                who = f"{cells['submission']}, {criterion}"
+                raise ConfigError(f"{path.name} line {line}: {who} is already in line {first}")
+            wishes.append(
+                WantedPoints(
+                    submission=cells["submission"],
+                    criterion=criterion,
+                    points=given,
+                    why=cells.get("why") or why,
+                    line=int(str(line)),
+                )
+            )
+    return wishes
+
 
 MOST_LETTERS = 1_000  # characters of a reason or an answer: about one paragraph
 MOST_OPEN = 4  # waiting requests per submission; a team with more doubts should talk to a TA

@@ -17,20 +17,17 @@ from sqlalchemy import Connection, Row, func, select
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Grade, read_grade
 from pipeline.grading.gradebook import decisions
-from pipeline.grading.gradebook.changes import points_changes, rubric_changes
 from pipeline.grading.gradebook.class_lines import ClassNow, GradeSummary, class_frame
 from pipeline.grading.gradebook.database import Database
-from pipeline.grading.gradebook.decisions import Conflict, RequestRefused
-from pipeline.grading.gradebook.entry import Entry
-from pipeline.grading.gradebook.erase import erase_rows
-from pipeline.grading.gradebook.events import (
+from pipeline.grading.gradebook.decisions import Conflict, RequestRefused, WantedPoints
+from pipeline.grading.gradebook.entry import (
     POINTS,
     TOTAL,
+    Entry,
     Event,
     Request,
 )
-from pipeline.grading.gradebook.history import read_history
-from pipeline.grading.gradebook.override import WantedPoints
+from pipeline.grading.gradebook.history import points_changes, read_history, rubric_changes
 from pipeline.grading.gradebook.rows import (
     GRADING,
     add_event,
@@ -39,6 +36,7 @@ from pipeline.grading.gradebook.rows import (
     by_other_rubrics,
     carry_over,
     class_list,
+    erase_rows,
     find_requests,
     first_keys,
     in_class,

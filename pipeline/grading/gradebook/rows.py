@@ -2,25 +2,38 @@
 
 import hashlib
 import json
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from typing import Any
 
 from pydantic import ValidationError
-from sqlalchemy import ColumnElement, Connection, Row, Select, Table, func, insert, select
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Row,
+    Select,
+    Table,
+    delete,
+    func,
+    insert,
+    select,
+    update,
+)
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, read_grade
 from pipeline.grading.gradebook.class_lines import ClassRow, GradeSummary
 from pipeline.grading.gradebook.database import Database
-from pipeline.grading.gradebook.entry import Entry
-from pipeline.grading.gradebook.events import REQUESTS, Event, newest_points, reviewer
+from pipeline.grading.gradebook.entry import REQUESTS, Entry, Event, newest_points, reviewer
 from pipeline.grading.gradebook.schema import (
     batches,
+    drop_copied,
     entries,
     events,
     figures,
+    findings,
     gradings,
     submissions,
 )
@@ -417,3 +430,31 @@ def read_rubric(batch: Row) -> Rubric:
             "the gradebook's rubric was written by another version of cartlab: run cartlab grade "
             "again"
         ) from None
+
+
+# -------------------------------------------------------------------------- erasing
+
+NOBODY = "an erased submission"
+
+
+def erase_rows(connection: Connection, gone: Mapping[int, str]) -> None:
+    """Delete all rows about the submissions in `gone`, which maps their numbers to their names.
+
+    Teams that shared recordings with an erased submission keep the flag, without the erased name.
+    """
+    numbers = list(gone)
+    graded = select(gradings.c.id).where(gradings.c.submission_id.in_(numbers))
+    drop_copied(connection)
+    for table in (figures, findings):
+        connection.execute(delete(table).where(table.c.grading_id.in_(graded)))
+    for table in (entries, events, gradings):
+        connection.execute(delete(table).where(table.c.submission_id.in_(numbers)))
+    connection.execute(delete(submissions).where(submissions.c.id.in_(numbers)))
+    flagged = select(entries.c.batch_id, entries.c.position, entries.c.shared)
+    names = "|".join(re.escape(json.dumps(name)[1:-1]) for name in gone.values())
+    any_name = re.compile(rf"(?<![\w-])(?:{names})(?![\w-])")
+    for row in connection.execute(flagged.where(entries.c.shared != "")).all():
+        where = (entries.c.batch_id == row.batch_id) & (entries.c.position == row.position)
+        erased = any_name.sub(NOBODY, row.shared)
+        if erased != row.shared:
+            connection.execute(update(entries).where(where).values(shared=erased))

@@ -10,8 +10,7 @@ from pipeline.arrays import Array
 from pipeline.grading import limits
 from pipeline.grading import rubric as asked
 from pipeline.grading.judge.context import GradingContext, Verdict
-from pipeline.grading.mistakes.controller import Controller, does, same_gains
-from pipeline.grading.mistakes.loop_numbers import LoopNumbers
+from pipeline.grading.mistakes.controller import Controller, LoopNumbers, does, same_gains
 from pipeline.grading.mistakes.state_model import order_names
 from pipeline.grading.reference import OFF_SCALE, Reference, clock_units, off_scale
 from pipeline.grading.tolerance import (

@@ -18,9 +18,9 @@ from pipeline.grading.judge.award import award
 from pipeline.grading.judge.checks import judge_with_undoing
 from pipeline.grading.judge.context import GradingContext, Judgement, data_flag, missing_flag
 from pipeline.grading.mistakes.controller import diagnose_controller, reported_controller
-from pipeline.grading.mistakes.no_fit import copied_final
 from pipeline.grading.mistakes.reduced import diagnose_reduced
 from pipeline.grading.mistakes.state_model import diagnose_state_space, find_order, state_models
+from pipeline.grading.mistakes.table_flags import copied_final
 from pipeline.grading.mistakes.tables import diagnose_tables
 from pipeline.grading.mistakes.undo import swapped_order
 from pipeline.grading.reference import (

@@ -1,15 +1,24 @@
-"""The flags of the parameter tables; each shows the number that makes the mistake clearest."""
+"""The flags of the parameter tables; each shows the number that makes the mistake clearest.
+
+Here are also the mistakes that a table shows by itself: numbers that no real carts can have, by
+their signs and order, and final estimates that were copied from the initial ones.
+"""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from decimal import Decimal
+from fractions import Fraction
+from math import exp
 
 from pipeline.grading import limits
 from pipeline.grading.grade import CODES, Code, Flag
 from pipeline.grading.mistakes.explain import ExplainedNumbers, Label, Table
 from pipeline.grading.reference import Reference, References
-from pipeline.grading.tolerance import as_typed, percent_off
+from pipeline.grading.tolerance import as_typed, half_digit, is_vague, percent_off, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
+from pipeline.plant.identities import parameter_orders
+from pipeline.plant.limits import HEAVY_DAMPING
 from pipeline.submission import Reported
 
 _TOLD: dict[Label, str] = {"initial": "first_estimate", "final": "final_estimate"}
@@ -160,3 +169,139 @@ def _evidence(name: str, typed: Decimal, reference: Reference | None, table: str
         if reference.value:
             evidence["ratio"] = float(typed) / reference.value
     return evidence
+
+
+@dataclass(frozen=True, kw_only=True)
+class BrokenOrder:
+    """Two numbers of a table that break the law `lesser ≤ greater`."""
+
+    lesser: str
+    greater: str
+    reason: str
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Both parameter names."""
+        return self.lesser, self.greater
+
+    @property
+    def is_of_gains(self) -> bool:
+        """Return whether the two numbers are static gains."""
+        return read_name(self.lesser).is_gain
+
+    @property
+    def is_plain(self) -> bool:
+        """Return whether the law is obvious to students, as it is for gains and resonances.
+
+        Laws about nulls and about frequencies of single carts are not obvious. Then the number from
+        the recordings helps the student more.
+        """
+        return self.is_of_gains or all(read_name(name).is_mode for name in self.names)
+
+    def flag(self, table: Mapping[str, Decimal], label: str) -> Flag:
+        """Return the flag for the two numbers."""
+        low, high = table[self.lesser], table[self.greater]
+        return Flag(
+            code="physically_impossible",
+            parameters=self.names,
+            message=WORDS.text(
+                "broken_order",
+                lesser=self.lesser,
+                low=as_typed(low),
+                greater=self.greater,
+                high=as_typed(high),
+                table=label,
+                reason=self.reason,
+            ),
+            evidence={
+                "table": label,
+                "reported": {self.lesser: float(low), self.greater: float(high)},
+                "ratio": float(low / high),
+            },
+        )
+
+
+def not_positive(table: Mapping[str, Decimal]) -> list[str]:
+    """Return the parameters that are zero or negative."""
+    return [name for name, typed in table.items() if typed <= 0]
+
+
+def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:
+    """Return the laws of order that a table breaks by more than rounding and usual errors.
+
+    Parameters
+    ----------
+    initial : whether this is the initial table, whose numbers are read off plots.
+    """
+    # Numbers from a fit are right within a few percent; first estimates are less precise.
+    slack = 1.2 if initial else 1.1
+    heavy = any(v > HEAVY_DAMPING for n, v in table.items() if read_name(n).is_ratio)
+    broken = []
+    for lesser, greater, reason in parameter_orders(list(table)):
+        if heavy and read_name(lesser).is_frequency:
+            continue
+        low, high = table[lesser], table[greater]
+        if low <= 0 or high <= 0:
+            continue
+        least = low - Decimal(float(rounding(low)))
+        most = high + Decimal(float(rounding(high)))
+        if float(least) > slack * float(most):
+            broken.append(BrokenOrder(lesser=lesser, greater=greater, reason=reason))
+    return broken
+
+
+def copied_final(reported: Reported, *, references: References) -> list[str]:
+    """Return the final estimates that equal the initial ones, if this is no coincidence.
+
+    Students may honestly keep the numbers of single carts, so most numbers that only a fit can give
+    must be equal too. The strongest evidence is a guessed damping that did not change. Tables typed
+    with single digits are ignored, because rounding makes them agree.
+    """
+    both = [name for name in reported.final if name in reported.initial]
+    same = [n for n in both if _same(reported, n)]
+    most = 0.75  # least share of equal numbers
+    if not both or len(same) < most * len(both):
+        return []
+    if 2 * sum(is_vague(reported.final[name]) for name in same) > len(same):
+        return []
+    fitted = [name for name in both if read_name(name).is_by_eye]
+    if len([name for name in fitted if name in same]) < most * len(fitted):
+        return []
+    chance = 1.0
+    for name in same:
+        chance *= _coincidence(reported.final[name], references.final.get(name), name)
+    return same if chance < 3e-3 else []  # a fit rarely reproduces so many numbers by chance
+
+
+def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> float:
+    """Return the probability that a fit gives the same digits as the first estimate.
+
+    It is high if the first estimate was right to its last digit, or if few digits were typed.
+    """
+    if not typed:
+        return 1.0
+    damping = read_name(name).is_damping
+    half = half_digit(typed) / abs(Fraction(typed))
+    # Usual relative difference between first and final estimate; smaller where the data are
+    # precise.
+    apart, surprise = 0.15 if damping else 0.01, 0.0
+    if reference is not None and reference.low > 0:
+        # A number with a single digit is rounded more than grading allows for.
+        hidden = half - rounding(typed) / abs(Fraction(typed))
+        off = max(float(percent_off(typed, reference, sigmas=limits.SIGMAS) / 100 - hidden), 0.0)
+        if reference.within(1.05 if damping else 1.01):
+            apart = 0.03 if damping else 0.003
+            if off == 0:
+                return 1.0
+        measured = not damping and not read_name(name).is_by_eye
+        # A larger error points to a mistake, perhaps the same one in both tables, not to a poor
+        # fit.
+        if not measured or off <= 0.2:
+            surprise = min(0.5 * (off / apart) ** 2, 3.0)
+    # A difference of two normal errors has the density 1/√(4π) at zero.
+    again = 1.0 if is_vague(typed) else min(1.0, 2 * float(half) / (apart * 3.5))
+    return again * exp(-surprise)
+
+
+def _same(reported: Reported, name: str) -> bool:
+    return reported.final[name] == reported.initial[name]

@@ -6,19 +6,25 @@ from decimal import Decimal
 
 from pipeline.grading import limits
 from pipeline.grading.grade import Code, Flag
-from pipeline.grading.mistakes.catalogue import ExplanationKey, Mistake, known_mistakes
+from pipeline.grading.mistakes.catalogue import (
+    ExplanationKey,
+    Mistake,
+    known_mistakes,
+    transient_fits,
+)
 from pipeline.grading.mistakes.explain import ExplainedNumbers, Explanation, Label, Table, explain
-from pipeline.grading.mistakes.impossible import BrokenOrder, broken_orders, not_positive
 from pipeline.grading.mistakes.table_flags import (
     OTHER,
+    BrokenOrder,
+    broken_orders,
     copied_flag,
     disagreement_flag,
     impossible_flag,
     limit,
+    not_positive,
     off_flag,
     specific_flags,
 )
-from pipeline.grading.mistakes.transient import transient_fits
 from pipeline.grading.mistakes.undo import Slip, Slipped, undo
 from pipeline.grading.reference import Reference, References, is_linear
 from pipeline.grading.tolerance import percent_off

@@ -13,9 +13,8 @@ from pipeline import __version__
 from pipeline.grading.grade import CODES, Code
 from pipeline.grading.gradebook.class_lines import GradeSummary, class_frame, wrong_springs
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.similarity.clusters import Cluster
-from pipeline.grading.similarity.distant import Distant
-from pipeline.grading.similarity.repeated_authors import RepeatedAuthors
+from pipeline.grading.similarity.class_questions import Distant, RepeatedAuthors
+from pipeline.grading.similarity.shared_data import Cluster
 from pipeline.grading.tolerance import exact
 from pipeline.grading.words import WORDS, on_one_line, points_text, signed_points
 from pipeline.report.builder import PageBuilder, Part

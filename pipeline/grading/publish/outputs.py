@@ -17,13 +17,15 @@ from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.view import KEY_FILE, STRANGER, key_text, pseudonyms, view
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.similarity.clusters import find_clusters, renamed
-from pipeline.grading.similarity.distant import Quantity, find_distant, recomputed_numbers
-from pipeline.grading.similarity.repeated_authors import (
+from pipeline.grading.similarity.class_questions import (
+    Quantity,
     RepeatedAuthors,
+    find_distant,
     find_repeated_authors,
+    recomputed_numbers,
     with_recordings,
 )
+from pipeline.grading.similarity.shared_data import find_clusters, renamed
 from pipeline.grading.words import on_one_line
 from pipeline.output import csv_text, own_folder, write_file
 from pipeline.resources import TEMPLATES

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.entry import Entry, with_overrides
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.override import with_overrides
+from pipeline.grading.judge.award import needs_recordings, read_findings, recompute_points
 from pipeline.grading.judge.context import Judgement
-from pipeline.grading.judge.recompute import needs_recordings, read_findings, recompute_points
 from pipeline.grading.rubric import Rubric
 from pipeline.words.progress import Progress, silent
 

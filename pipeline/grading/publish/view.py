@@ -19,9 +19,8 @@ from pipeline.grading.gradebook.class_lines import GradeSummary
 from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import FAILED, Event
-from pipeline.grading.judge.remarks import find_remarks
-from pipeline.grading.rubric import Rubric
-from pipeline.grading.similarity.flag import shared_message, student_message
+from pipeline.grading.rubric import Rubric, find_remarks
+from pipeline.grading.similarity.shared_data import shared_message, student_message
 from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.output import csv_text
 from pipeline.words.text import with_symbols

@@ -17,18 +17,16 @@ import numpy as np
 from pipeline.grading.gradings import Member
 from pipeline.grading.platforms import same_number
 from pipeline.grading.similarity.fingerprints import PASSED, Fingerprint, unpack
-from pipeline.grading.similarity.matching import (
+from pipeline.grading.similarity.noise import (
     LEAST_OVERLAP,
     LEAST_SLOPE,
-    Match,
-    compare,
-    equal_rows,
-)
-from pipeline.grading.similarity.noise import (
     Agreement,
     Heard,
+    Match,
     agreements,
+    compare,
     copied,
+    equal_rows,
     padded_length,
     usual,
 )

@@ -1,4 +1,7 @@
-"""Compare the noise of two submissions, all recordings together.
+"""Compare the noise of two recordings at a time shift, and of all recordings of two submissions.
+
+A copy has the noise of its original. So if one noise is regressed on the other, at the same scale,
+the slope is one. This only suggests where to look for equal rows, which prove a copy.
 
 The noise of one recording may agree by chance, or because the bench knocks and its encoder rounds
 in the same way in every run. So the noise of most recordings counts together, beyond what other
@@ -12,21 +15,128 @@ of its spectrum, such as the rounding of a steady sine, counts no more than a li
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.grading.similarity.fingerprints import EVERY, Fingerprint
-from pipeline.grading.similarity.matching import Match
+from pipeline.grading.similarity.fingerprints import EVERY, PASSED, STEPS_PER_SIGMA, Fingerprint
 from pipeline.grading.similarity.releases import Delay, is_decay
+
+LEAST_OVERLAP = 80  # smallest number of samples in which both recordings have noise
+LEAST_SLOPE = 0.5
+# Smallest noise from which the scale between two recordings is estimated.
+_LEAST_NOISE = 0.5 * STEPS_PER_SIGMA
+# Residuals are stored as whole steps, so each may be wrong by half a step.
+_SAME_STEPS, _SAME_PART = 1.0, 0.003
+_EQUAL_PART = 0.5  # share of the shorter recording that must be equal
+_DIFFERENT_STEPS = 4  # encoder steps; readings closer than this count as equal
+
+
+@dataclass(frozen=True, kw_only=True)
+class Match:
+    """The similarity of two recordings.
+
+    Attributes
+    ----------
+    times : start and end of the compared or equal part, in s, in each recording.
+    slope : slope of one noise on the other.
+    sigmas : agreement of the noise, in standard deviations above chance.
+    equal_rows : number of consecutive rows that are equal up to a factor; 0 if not significant.
+    different : number of different readings in these rows.
+    delay : samples between two decays that are one motion, None if this is not known.
+    """
+
+    experiments: tuple[str, str]
+    times: tuple[tuple[float, float], tuple[float, float]]
+    slope: float = 0.0
+    sigmas: float = 0.0
+    equal_rows: int = 0
+    different: int = 0
+    delay: float | None = None
+
+
+def compare(a: Fingerprint, b: Fingerprint, *, shift: int) -> Match:
+    """Compare the noise of two recordings.
+
+    Parameters
+    ----------
+    shift : shift between the recordings: sample i of `a` corresponds to sample i + shift of `b`.
+    """
+    first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
+    found = _between(a, b, shift=shift, first=first, last=last)
+    if last - first < LEAST_OVERLAP:
+        return found
+    # All carts are scaled to units of b's noise, so that each of them counts.
+    of_a, of_b = a.spread(first, last), b.spread(first + shift, last + shift)
+    factor = of_b / of_a * a.step / b.step if of_a * of_b > 0 else np.ones(len(a.step))
+    in_a = a.noise[:, first:last] * factor[:, None]
+    in_b = b.noise[:, first + shift : last + shift]
+    both = in_a * in_b != 0
+    n = np.count_nonzero(both, axis=1)
+    if n.sum() < LEAST_OVERLAP:
+        return found
+    in_a, in_b = in_a * both, in_b * both
+    for row in range(len(a.measured), len(n)):  # the input has another scale than the carts
+        in_a[row] *= np.linalg.norm(in_b[row]) / max(np.linalg.norm(in_a[row]), 1e-30)
+    x = np.stack([in_a, in_b], axis=1)
+    left = x @ x.transpose(0, 2, 1)
+    # Signs may be reversed in a copy: of all carts together, and of the input.
+    product = sum(abs(float(part[:, 0, 1].sum())) for part in np.split(left, [len(a.measured)]))
+    of_a, of_b = np.diag(left.sum(axis=0)).tolist()
+    if not of_a * of_b > 0:
+        return found
+    chance = float(np.sqrt(of_a * of_b / (PASSED * n.sum())))
+    return replace(found, slope=product / min(of_a, of_b), sigmas=product / chance)
+
+
+def _between(a: Fingerprint, b: Fingerprint, *, shift: int, first: int, last: int) -> Match:
+    """Return a result for a part of `a`, with experiments and times but without similarity."""
+    return Match(
+        experiments=(a.experiment, b.experiment),
+        times=(a.times(first, last), b.times(first + shift, last + shift)),
+    )
+
+
+def equal_rows(a: Fingerprint, b: Fingerprint, *, shift: int) -> Match | None:
+    """Return the longest stretch in which two recordings are equal, up to a factor per channel.
+
+    Repeated readings, as from a cart at rest, count once. Returns None if too few remain to be
+    significant.
+    """
+    first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
+    if last - first < LEAST_OVERLAP:
+        return None
+    in_a = a.measured[:, first:last].astype(np.float64)
+    in_b = b.measured[:, first + shift : last + shift].astype(np.float64)
+    equal = np.ones(last - first, dtype=bool)
+    for of_a, of_b in zip(in_a, in_b, strict=True):
+        loud = np.abs(of_a) >= _LEAST_NOISE
+        factor = float(np.median(of_b[loud] / of_a[loud])) if np.any(loud) else 0.0
+        most = _SAME_STEPS * (1 + abs(factor)) + _SAME_PART * np.abs(of_b)
+        equal &= np.abs(of_b - factor * of_a) <= most
+    ends = np.flatnonzero(np.diff(equal, prepend=False, append=False)).reshape(-1, 2)
+    if not ends.size:
+        return None
+    start, stop = ends[np.argmax(ends[:, 1] - ends[:, 0])].tolist()
+    rows = np.round(in_b[:, start:stop].T / _DIFFERENT_STEPS)
+    different = len(np.unique(np.hstack([rows[:-1], rows[1:]]), axis=0)) * len(in_b)
+    shorter = min(a.residual.shape[1], b.residual.shape[1])
+    if different < LEAST_OVERLAP or stop - start < _EQUAL_PART * shorter:
+        return None
+    return replace(
+        _between(a, b, shift=shift, first=first + start, last=first + stop),
+        equal_rows=stop - start,
+        different=different,
+    )
+
 
 _BANDS = ((0.2, 0.3), (0.3, 0.4), (0.4, 0.5))  # cycles per sample, above the fingerprint's corner
 _BANDWIDTH = 0.2  # of each band, as a share of the Nyquist frequency
 _SMOOTHED = 33  # lines of the spectrum over which its level is averaged
 _LOUDEST = 1.3  # times this level; a line counts no more
-_LEAST_OVERLAP = 0.6  # of the shorter recording
+_LEAST_SHARE = 0.6  # of the shorter recording
 _MOST = 4.0  # sigmas in a band that count, so that no recording decides alone
 # Sum of three squared sigmas by which any time shift must exceed those that the motion suggests;
 # chance gives 19 among 2,000 shifts.
@@ -168,7 +278,7 @@ def _compared(a: Heard, b: Heard, delay: Delay | None) -> Agreement:
     spectrum = np.sum(np.conj(a.spectra) * b.spectra, axis=1)
     spectrum = np.pad(spectrum, ((0, 0), (_first_line(a.length), 0)))
     products = np.asarray(irfft(spectrum, a.length, axis=1))
-    least = round(_LEAST_OVERLAP * min(a.n, b.n))
+    least = round(_LEAST_SHARE * min(a.n, b.n))
     shifts = np.arange(least - a.n, b.n - least + 1)
     overlap = np.minimum(a.n, b.n - shifts) - np.maximum(0, -shifts)
     sigmas = products[:, shifts] * np.sqrt(_BANDWIDTH / (overlap * a.spectra.shape[1]))
@@ -201,7 +311,7 @@ def _motion_shifts(a: Array, b: Array) -> list[int]:
     a, b = a - a.mean(), b - b.mean()
     of_a, of_b = (np.asarray(rfft(x, length)) for x in (a, b))
     products = np.asarray(irfft(np.conj(of_a) * of_b, length))
-    least = max(1, round(_LEAST_OVERLAP * min(a.size, b.size)))
+    least = max(1, round(_LEAST_SHARE * min(a.size, b.size)))
     shifts = np.arange(least - a.size, b.size - least + 1)
     first, last = np.maximum(0, -shifts), np.minimum(a.size, b.size - shifts)
     means: list[Array] = []

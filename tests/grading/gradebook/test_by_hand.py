@@ -10,12 +10,11 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion, Grade, read_grade
 from pipeline.grading.gradebook.class_lines import GradeSummary
-from pipeline.grading.gradebook.decisions import Conflict, points_lost
-from pipeline.grading.gradebook.events import TOTAL
+from pipeline.grading.gradebook.decisions import Conflict, points_lost, read_wishes
+from pipeline.grading.gradebook.entry import TOTAL
 from pipeline.grading.gradebook.history import history_text
-from pipeline.grading.gradebook.override import read_wishes
 from pipeline.grading.gradescope import results_text
-from pipeline.grading.judge.recompute import findings_text, read_findings, recompute_points
+from pipeline.grading.judge.award import findings_text, read_findings, recompute_points
 from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.export import export

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from pipeline.grading.gradebook.changes import points_changes, rubric_changes
 from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradebook.history import points_changes, rubric_changes
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.grades import finish, make_grade, n_graded, two_cart_rubric
 from tests.helpers.grading_students import write_team

@@ -2,8 +2,8 @@
 
 import pytest
 
+from pipeline.grading.gradebook.decisions import WantedPoints
 from pipeline.grading.gradebook.history import history_text
-from pipeline.grading.gradebook.override import WantedPoints
 from tests.helpers.grades import finish, make_grade, seen
 from tests.helpers.grading_students import criterion
 

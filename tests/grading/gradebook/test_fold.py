@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook import decisions
-from pipeline.grading.gradebook.entry import Entry
-from pipeline.grading.gradebook.events import POINTS, TOTAL, Event
+from pipeline.grading.gradebook.decisions import WantedPoints
+from pipeline.grading.gradebook.entry import POINTS, TOTAL, Entry, Event
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradebook.override import WantedPoints
 from pipeline.grading.tolerance import with_total
 from tests.helpers.grades import book_of, make_grade, two_cart_rubric
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.grading.judge.laws import judge_laws
+from pipeline.grading.judge.checks import judge_laws
 from pipeline.grading.mistakes.undo import Number
 from pipeline.plant.chain import PRESETS, Chain
 

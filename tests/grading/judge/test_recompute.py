@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipeline.grading.judge.recompute import (
+from pipeline.grading.judge.award import (
     findings_text,
     needs_recordings,
     read_findings,

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.estimation.bode_fit import fit_bode
 from pipeline.grading.grade import Flag
-from pipeline.grading.mistakes.transient import early_readings
+from pipeline.grading.mistakes.catalogue import early_readings
 from pipeline.results import FrequencyResponse
 from pipeline.setup import Setup
 from pipeline.submission import Reported, ReportedFeedback, ReportedStateSpace

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.grading.mistakes.loop_numbers import loop_numbers
+from pipeline.grading.mistakes.controller import loop_numbers
 from pipeline.plant.chain import Chain
 
 CHAIN = Chain(m=np.array([1.0]), c=np.array([0.2]), k=np.array([4.0, 0.0]))

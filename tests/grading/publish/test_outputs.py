@@ -18,7 +18,8 @@ from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import CODES, Adjustment, Flag, Grade
 from pipeline.grading.gradebook.class_lines import GradeSummary
-from pipeline.grading.gradebook.override import Event, read_points, with_overrides
+from pipeline.grading.gradebook.decisions import read_points
+from pipeline.grading.gradebook.entry import Event, with_overrides
 from pipeline.grading.gradescope import results_text
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import evidence_table, feedback_page, numbers_table

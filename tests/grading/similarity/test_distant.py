@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.grading.publish.outputs import write_outputs
-from pipeline.grading.similarity.distant import find_distant, recomputed_numbers
+from pipeline.grading.similarity.class_questions import find_distant, recomputed_numbers
 from pipeline.setup import PAPER_UNITS
 from tests.helpers.grades import book_of, make_grade, two_cart_rubric
 

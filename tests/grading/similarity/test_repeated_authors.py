@@ -8,12 +8,12 @@ import pytest
 
 from pipeline.grading.gradings import Member
 from pipeline.grading.publish.outputs import write_outputs
-from pipeline.grading.similarity.fingerprints import fingerprint
-from pipeline.grading.similarity.repeated_authors import (
+from pipeline.grading.similarity.class_questions import (
     RepeatedAuthors,
     find_repeated_authors,
     with_recordings,
 )
+from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
