@@ -6,10 +6,11 @@ Each command imports its own heavy modules, so that `--help` answers at once.
 """
 
 import errno
+import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
@@ -20,7 +21,6 @@ from typer.exceptions import TyperException
 
 from pipeline import __version__
 from pipeline.cli import INTERRUPTED, STOPPED
-from pipeline.cli.stopping import ctrl_c_says
 from pipeline.errors import PipelineError, is_disk_full, is_file_fault
 from pipeline.words.progress import Progress
 
@@ -172,3 +172,37 @@ def _options(
     ] = False,
 ) -> None:
     pass
+
+
+@contextmanager
+def ctrl_c_says(say: Callable[[], None]) -> Iterator[Callable[[], None]]:
+    """Call `say` when Ctrl-C is pressed; yield a function that then ends the work.
+
+    A library may turn an interrupt into a different error. And Python drops an interrupt in the
+    callback of a weak reference, for example during an import. In both cases, the next call of the
+    yielded function ends the work.
+    """
+    pressed = False
+
+    def stop(*_: object) -> None:
+        nonlocal pressed
+        pressed = True
+        raise KeyboardInterrupt
+
+    def check() -> None:
+        if pressed:
+            raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, stop)
+    try:
+        yield check
+        check()
+    except BaseException:
+        if not pressed:
+            raise
+        say()
+        sys.exit(INTERRUPTED)
+    finally:
+        signal.signal(signal.SIGINT, before)

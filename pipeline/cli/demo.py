@@ -1,9 +1,14 @@
-"""The command `demo`: the whole workflow on shipped examples."""
+"""The command `demo`: the whole workflow on shipped examples.
+
+`python -m` runs this module as the second process of the demo: it hides friction in a bench, then
+finds it.
+"""
 
 import json
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +18,9 @@ import typer
 
 from pipeline.cli.common import app, progress_line, say
 from pipeline.cli.grading import grade
-from pipeline.cli.reports import run_report
+from pipeline.cli.reports import explain, run_report
+from pipeline.startup import collect_seldom
+from pipeline.words.progress import Progress, silent
 
 
 @app.command()
@@ -46,7 +53,7 @@ def demo(
 @contextmanager
 def search_beside(out: Path) -> Iterator[subprocess.Popen[str]]:
     """Search for a hidden effect in a second process; this halves the time of the demo."""
-    command = [sys.executable, "-P", "-m", "pipeline.cli.hidden_bench", str(out)]
+    command = [sys.executable, "-P", "-m", "pipeline.cli.demo", str(out)]
     pipe, none = subprocess.PIPE, subprocess.DEVNULL
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=none, text=True) as beside:
         try:
@@ -64,6 +71,32 @@ def found_beside(beside: subprocess.Popen[str], out: Path) -> list[str]:
         if beside.wait() == 0:
             return json.loads(output)
         say(f"the second process failed (status {beside.returncode}): searching again here")
-        from pipeline.cli.hidden_bench import find_hidden
-
         return find_hidden(out, progress=progress)
+
+
+# ------------------------------------------------------------------- the second process
+
+
+def find_hidden(out: Path, *, progress: Progress) -> list[str]:
+    """Write a bench with hidden friction and its gap analysis; return the messages to print."""
+    from pipeline.gap.explain import predictor_compiled
+    from pipeline.simulated.hidden import prepare_bench
+    from pipeline.simulated.submission import write_submission
+
+    hidden, folder = prepare_bench(preset="throne-2dof", hide=["coulomb_friction"]), out / "bench"
+    if not (folder / "submission.toml").exists():
+        with predictor_compiled():
+            write_submission(folder, hidden, seed=0)
+    _, told = explain(folder, out=out / "gap", progress=progress)
+    return [*(f"hidden: {sentence}" for sentence in hidden.effect_sentences), *told]
+
+
+def _end_with_parent() -> None:
+    os.read(0, 1)  # returns when the process that started this one has ended
+    os._exit(1)  # safe at any time, because files are written whole or not at all
+
+
+if __name__ == "__main__":
+    collect_seldom()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    json.dump(find_hidden(Path(sys.argv[1]), progress=silent), sys.stdout)

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.common import AsJson, app, log_progress, say
-from pipeline.cli.stopping import ctrl_c_says
+from pipeline.cli.common import AsJson, app, ctrl_c_says, log_progress, say
 from pipeline.errors import ConfigError
 from pipeline.grading.platforms import PLATFORMS
 

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.testing import assert_allclose
 from typer.main import get_command
 
-from pipeline.cli.commands import app
+from pipeline.cli import app
 from pipeline.errors import ConfigError
 from pipeline.gap.residual import residual_forces
 from pipeline.gap.types import (

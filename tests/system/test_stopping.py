@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from pipeline.cli.stopping import ctrl_c_says
+from pipeline.cli.common import ctrl_c_says
 
 
 def _work(said: list[str], *, look: bool = False, error: Exception | None = None) -> None:
