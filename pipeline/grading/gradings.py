@@ -27,7 +27,7 @@ class Member:
     key : hash of everything that affects the grade (submitted files, rubric, code, name and
         lateness), a hyphen, and the hash of the files alone.
     fingerprints : noise patterns of the recordings, by which copies are found; see
-        `similarity.prints`.
+        `similarity.fingerprints`.
     reason : why the submission could not be graded, one cause per line, or "".
     grading : number of the grading in the gradebook.
     of_class : whether the submission belongs to the assignment that is being graded.
@@ -126,7 +126,7 @@ class Batch:
     failed : name and reason for each submission that could not be graded.
     unsettled : failed submissions that the next run grades again.
     disk_full : submissions that failed because the disk was full.
-    kept, moved, taken_over : changes to the class list; see `class_changes.ClassChanges`.
+    kept, moved, taken_over : changes to the class list; see `batch.runner.ClassChanges`.
     """
 
     keys: tuple[str, ...]

@@ -183,14 +183,14 @@ def grade_class(
                     paths=absolute, rubric=rubric_path, lateness=late, options=options.lasting()
                 )
                 save_run(out, run)
-            doubles = write_outputs(book, out, progress=lambda what: progress(total, total, what))
+            repeated = write_outputs(book, out, progress=lambda what: progress(total, total, what))
     return Summary(
         total=total,
         failed=tuple(sorted(failed)),  # sorted, so that their order does not reveal hidden names
         sharing=len(batch.shared),
         unsettled=len(batch.unsettled),
         disk_full=len(batch.disk_full),
-        remarks=(*remarks, *(f"{double}: see class.html" for double in doubles)),
+        remarks=(*remarks, *(f"{people}: see class.html" for people in repeated)),
         changes=tuple(changes),
     )
 

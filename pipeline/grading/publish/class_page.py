@@ -102,7 +102,7 @@ def _board(lines: Sequence[GradeSummary], points: "pd.Series", rubric: Rubric) -
 
 
 def _to_look_at(
-    lines: Sequence[GradeSummary], doubles: Sequence[RepeatedAuthors], distant: Sequence[Distant]
+    lines: Sequence[GradeSummary], repeated: Sequence[RepeatedAuthors], distant: Sequence[Distant]
 ) -> list[Block]:
     """Return what to look at: springs, failures, authors in several teams, unusual carts."""
     failed = [line for line in lines if line.status == "failed"]
@@ -120,8 +120,8 @@ def _to_look_at(
             blocks.append(Details(WORDS.spans("many_failed", n=str(len(failed))), (reasons,)))
         else:
             blocks += [paragraph(WORDS.text("some_failed")), reasons]
-    if doubles:
-        several = bullet_list(spans(f"{double}.") for double in doubles)
+    if repeated:
+        several = bullet_list(spans(f"{people}.") for people in repeated)
         blocks += [paragraph(WORDS.text("doubles")), several]
     if distant:
         others = bullet_list(spans(_link(one.submission), f": {one}.") for one in distant)

@@ -90,22 +90,22 @@ def write_outputs(
         lines.sort(key=lambda line: line.submission)
     _remove_stale(folder, keep=set(now_of))
     write_file(out / "grades.csv", grades_csv(lines, rubric=rubric))
-    doubles = repeated_authors_of(book, authors, gradings=gradings, names=names)
+    repeated = repeated_authors_of(book, authors, gradings=gradings, names=names)
     clusters = find_clusters(shared)
     if names is not None:
         clusters = renamed(clusters, names, other=STRANGER)
     distant = find_distant(numbers)
-    whole = lines, doubles, clusters, distant
+    whole = lines, repeated, clusters, distant
     now_of[_WHOLE] = _digest(layout, repr(whole), *now_of.values())
     if made_of.get(_WHOLE) != now_of[_WHOLE] or not (out / _CLASS).is_file():
         page = class_page(
-            lines, rubric=rubric, repeated_authors=doubles, clusters=clusters, distant=distant
+            lines, rubric=rubric, repeated_authors=repeated, clusters=clusters, distant=distant
         )
         write_file(out / _CLASS, page)
     write_file(
         folder / _MADE, json.dumps(now_of, indent=0, ensure_ascii=False, sort_keys=True) + "\n"
     )
-    return doubles
+    return repeated
 
 
 def repeated_authors_of(
@@ -123,20 +123,20 @@ def repeated_authors_of(
     names : pseudonyms by submission; None to show real names.
     """
     found = find_repeated_authors(authors)
-    concerned = dict.fromkeys(name for double in found for name in double.submissions)
+    concerned = dict.fromkeys(name for people in found for name in people.submissions)
     found = with_recordings(found, book.fingerprints([gradings[name] for name in concerned]))
     if names is None:
         return found
     return sorted(
         (
             replace(
-                double,
-                authors=("",) * len(double.authors),
-                submissions=tuple(sorted(names[s] for s in double.submissions)),
+                people,
+                authors=("",) * len(people.authors),
+                submissions=tuple(sorted(names[s] for s in people.submissions)),
             )
-            for double in found
+            for people in found
         ),
-        key=lambda double: double.submissions,
+        key=lambda people: people.submissions,
     )
 
 

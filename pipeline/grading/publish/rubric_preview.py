@@ -127,8 +127,8 @@ def _usable(text: str, before: Rubric, now: Rubric) -> Mapping[str, Judgement]:
 
 
 def _compared(entry: Entry, found: Mapping[str, Judgement], rubric: Rubric) -> TeamChange:
-    weighed = recompute_points(entry.grade, found, rubric=rubric)
-    after = with_overrides(weighed, entry.overrides, rubric=rubric, adjustments=entry.adjustments)
+    automatic = recompute_points(entry.grade, found, rubric=rubric)
+    after = with_overrides(automatic, entry.overrides, rubric=rubric, adjustments=entry.adjustments)
     had, has = _points(entry.grade), _points(after)
     return TeamChange(
         submission=entry.submission,

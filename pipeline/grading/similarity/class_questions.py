@@ -20,6 +20,8 @@ from pipeline.names import read_name
 from pipeline.words.numbers import count, listing, significant, unit_text
 from pipeline.words.text import clean
 
+# ----------------------------------------------------------------- repeated authors
+
 _MOST_SUBMISSIONS = 8  # submissions named for one person
 
 
@@ -73,27 +75,29 @@ def find_repeated_authors(authors: Mapping[str, Sequence[str]]) -> list[Repeated
 
 
 def with_recordings(
-    doubles: Iterable[RepeatedAuthors], prints: Iterable[Member]
+    repeated: Iterable[RepeatedAuthors], members: Iterable[Member]
 ) -> list[RepeatedAuthors]:
-    """Return the doubles with the number of recordings that their submissions share.
+    """Return the people with the number of recordings that their submissions share.
 
     Recordings that were given out by the lab count too.
     """
-    alone = [replace(one, authors=(one.submission,)) for one in prints]
+    alone = [replace(one, authors=(one.submission,)) for one in members]
     shared = find_copies(alone)
     read = {one.submission for one in alone if one.fingerprints}
     return [
         replace(
-            double,
+            people,
             recordings=max(
-                len({r.experiment for r in shared.get(a, ()) if r.submission in double.submissions})
-                for a in double.submissions
+                len({r.experiment for r in shared.get(a, ()) if r.submission in people.submissions})
+                for a in people.submissions
             ),
-            compared=read.issuperset(double.submissions),
+            compared=read.issuperset(people.submissions),
         )
-        for double in doubles
+        for people in repeated
     ]
 
+
+# ----------------------------------------------------- carts unlike those of the class
 
 _FEWEST_TEAMS = 5  # from which a class has a median
 _MOST_SPREADS = 10  # median absolute deviations from the median that are usual

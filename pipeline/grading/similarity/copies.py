@@ -119,10 +119,10 @@ def find_copies(
     equal: dict[tuple[int, int], list[Match]] = defaultdict(list)
     total: dict[tuple[int, int], float] = defaultdict(float)
     for _, entries in sorted(groups.items()):
-        for pair, likeness in _equal(
+        for pair, match in _equal(
             entries, first_batch=len(batch), everyone=len(everyone), owners=owners, total=total
         ):
-            equal[pair].append(likeness)
+            equal[pair].append(match)
     compared = sum(len(entries) ** 2 for entries in groups.values())
     given = {
         (a, one.experiments[0])
@@ -163,7 +163,7 @@ def _by_group(owners: Iterable[Member]) -> dict[str, list[_Entry]]:
 
 
 def _record_of(one: Match, mine: int, other: int, *, submission: str) -> SharedRecord:
-    """Return a likeness as seen from one of the two submissions."""
+    """Return a match as seen from one of the two submissions."""
     return SharedRecord(
         experiment=one.experiments[mine],
         submission=submission,
@@ -252,16 +252,16 @@ class _Pairs:
             for group, prints in self._prints[submission].items()
         }
 
-    def worth_hearing(self, likeness: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
+    def worth_hearing(self, similarity: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
         """Return the pairs of submissions whose noise is compared.
 
         Parameters
         ----------
-        likeness : similarity of pairs in the first comparison.
+        similarity : similarity of pairs in the first comparison.
         """
         kept = {pair for pair in self._delays if self._chance(pair) < _RELEASED_ALIKE}
         taken: Counter[int] = Counter()
-        for pair, _ in sorted(likeness.items(), key=lambda one: (-one[1], one[0])):
+        for pair, _ in sorted(similarity.items(), key=lambda one: (-one[1], one[0])):
             if pair in self._delays and min(taken[one] for one in pair) < _MOST_SIMILAR:
                 kept.add(pair)
                 taken.update(pair)
@@ -378,15 +378,15 @@ def _equal(
         if compared[pair] > _MOST_COMPARED * (recordings[a.owner] + recordings[b.owner]):
             continue
         total[pair] += sigmas**2
-        likeness = compare(a.print, b.print, shift=shift)
-        if likeness.slope < LEAST_SLOPE or likeness.sigmas <= most[i, j]:
+        match = compare(a.print, b.print, shift=shift)
+        if match.slope < LEAST_SLOPE or match.sigmas <= most[i, j]:
             continue
-        most[i, j] = likeness.sigmas
+        most[i, j] = match.sigmas
         if equal := equal_rows(a.print, b.print, shift=shift):
-            best[i, j] = replace(equal, slope=likeness.slope, sigmas=likeness.sigmas)
+            best[i, j] = replace(equal, slope=match.slope, sigmas=match.sigmas)
             partner[i, b.owner], partner[j, a.owner] = j, i
-    for (i, j), likeness in sorted(best.items(), key=lambda one: one[0]):
-        yield (entries[i].owner, entries[j].owner), likeness
+    for (i, j), match in sorted(best.items(), key=lambda one: one[0]):
+        yield (entries[i].owner, entries[j].owner), match
 
 
 def _candidates(

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.grading.grade import Criterion
-from pipeline.grading.publish.feedback import draw_figures, draw_records, numbers_in
+from pipeline.grading.publish.feedback_figures import draw_figures, draw_records, numbers_in
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.identities import transfer_functions
 from pipeline.report.figures.grading import reported_magnitude
