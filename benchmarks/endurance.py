@@ -41,7 +41,7 @@ from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.judge.award import findings_text
 from pipeline.grading.judge.run import under_rubric
-from pipeline.grading.publish.feedback import draw_figures, draw_records
+from pipeline.grading.publish.feedback_figures import draw_figures, draw_records
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.fingerprints import fingerprint
