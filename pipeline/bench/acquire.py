@@ -1,6 +1,9 @@
-"""Record the plan of a submission on a bench; a later session continues where this one ended."""
+"""Record the plan of a submission on a bench, or explore it, while people watch and intervene.
 
-from collections.abc import Callable, Collection, Generator, Iterator
+A later session continues where this one ended.
+"""
+
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,10 +28,12 @@ from pipeline.bench.experiments import (
     scale_remarks,
 )
 from pipeline.bench.orders import Order, order_on
-from pipeline.bench.raw import free_raw_path
+from pipeline.bench.raw import free_raw_path, known_commands
 from pipeline.bench.run import Session
 from pipeline.bench.serial_line import Runaway, SerialLine, open_line
 from pipeline.errors import ConfigError, DataError, HardwareError, PipelineError
+from pipeline.experiments.exploration import Exploration, Recorded, Turn
+from pipeline.experiments.information import ErrorGoal
 from pipeline.experiments.plan import (
     Plan,
     Recording,
@@ -36,12 +41,14 @@ from pipeline.experiments.plan import (
     load_plan,
     plan_path,
     save_plan,
+    session_time,
 )
 from pipeline.experiments.propose import extend_plan, propose_plan
 from pipeline.lock import lock_or_refuse
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
 from pipeline.submission.toml import Value
+from pipeline.words.text import with_symbols
 
 _USUAL_BAUD = 115_200
 _TRIES = 3  # attempts per recording; a fault that occurs three times is no accident
@@ -402,3 +409,65 @@ def _is_lost(line: SerialLine) -> bool:
     except HardwareError:
         return True
     return False
+
+
+def explore_bench(
+    folder: Path,
+    *,
+    port: str,
+    observer: Observer,
+    buttons: Buttons | None,
+    goal: ErrorGoal,
+    write_diary: Callable[..., object],
+    seconds: float,
+    vetoes: Callable[[Recording], bool] = lambda recording: False,
+) -> tuple[Turn, ...]:
+    """Explore the bench at a port; return the turns.
+
+    Parameters
+    ----------
+    observer, buttons : see `acquire`. "skip" vetoes the chosen recording, before or during it;
+        "stop" ends the exploration, even during a computation.
+    goal, seconds, vetoes, write_diary : see `Exploration`.
+
+    Raises
+    ------
+    Stopped : a signal or a button ended the exploration.
+    HardwareError, ConfigError, DataError : see `acquire` and `Exploration`.
+    """
+    buttons = buttons or Buttons()
+
+    def record(ids: Sequence[str]) -> Recorded:
+        outcomes = acquire(folder, port=port, observer=observer, only=ids, buttons=buttons)
+        if astray := [o.partial for o in outcomes if o.is_astray]:
+            raise Runaway(f"{astray[-1]}; the exploration ends here")
+        made = tuple(o.recording.id for o in outcomes if not o.partial)
+        tried = [o.recording for o in outcomes if o.lines]
+        skipped = any(o.wish == "skip" for o in outcomes)
+        ends = dict.fromkeys(o.partial for o in outcomes if o.partial)
+        return Recorded(
+            ids=made,
+            seconds=session_time(tried),
+            vetoed=skipped and not made,
+            why=". Then: ".join(ends),
+        )
+
+    def think(stage: str) -> None:
+        if buttons.pressed == "stop":
+            raise Stopped("by hand")
+        observer.thinking(stage)
+
+    if (folder / NAME).exists():
+        ensure_plan(folder, port=port)
+    exploration = Exploration(
+        folder=folder,
+        record=record,
+        write_diary=write_diary,
+        known_commands=known_commands,
+        goal=goal,
+        seconds=seconds,
+        announce=lambda sentence: observer.thought(with_symbols(sentence)),
+        progress=think,
+        vetoes=vetoes,
+    )
+    return exploration.run()

@@ -219,7 +219,7 @@ def explore(
     ] = False,
 ) -> None:
     """Record, identify, analyse the gap and choose the next recording, until the goal is met."""
-    from pipeline.bench.explore import explore_bench
+    from pipeline.bench.acquire import explore_bench
     from pipeline.experiments.information import read_error_goal, read_time
     from pipeline.report.exploration import NAME, write_diary
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.bench.explore import explore_bench
-from pipeline.bench.run_watch import LineWatch
+from pipeline.bench.acquire import explore_bench
+from pipeline.bench.run import LineWatch
 from pipeline.errors import HardwareError
 from pipeline.experiments.information import ErrorGoal
 from pipeline.experiments.plan import PlanLimits, Recording

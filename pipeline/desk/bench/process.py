@@ -55,7 +55,7 @@ def _acquire(folder: Path, request: dict[str, Any], state: LiveState) -> str:
 
 def _explore(folder: Path, request: dict[str, Any], state: LiveState) -> str:
     """Explore; return a sentence on what is known at the end."""
-    from pipeline.bench.explore import explore_bench
+    from pipeline.bench.acquire import explore_bench
     from pipeline.experiments.information import read_error_goal, read_time
     from pipeline.report.exploration import write_diary
     from pipeline.words.text import with_symbols
