@@ -227,8 +227,7 @@ def check_grading(
     files : uploaded archives.
     skip : folder of the class, whose content is not graded; "" if there is no such folder.
     """
-    from pipeline.grading.intake.find import check_hand_ins
-    from pipeline.grading.intake.late_table import read_late_table
+    from pipeline.grading.intake.find import check_hand_ins, read_late_table
     from pipeline.grading.rubric_file import load_rubric
 
     wrong: dict[str, str] = {}
