@@ -3,6 +3,7 @@
 import asyncio
 import re
 import socket
+from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
 from inspect import iscoroutinefunction
 from pathlib import Path
@@ -11,14 +12,14 @@ from typing import Any, Self
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.convertors import IntegerConvertor, register_url_convertor
-from starlette.datastructures import FormData
+from starlette.datastructures import FormData, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pipeline.desk.bench import bench_page
-from pipeline.desk.flow import limit_each_person
 from pipeline.desk.grades import (
     bulk_change,
     class_actions,
@@ -31,14 +32,12 @@ from pipeline.desk.home import enter, open_place, show_folders, show_home
 from pipeline.desk.instructor import exercise_pages, rubric_pages
 from pipeline.desk.login import PAGE_HEADERS, JupyterLogin, ProxyLogin, SecretLogin, limit_bodies
 from pipeline.desk.page_request import Desk, PageRequest, plain_error, prepare_pages
-from pipeline.desk.scratch import clear_scratch
-from pipeline.desk.served_files import serve_file, serve_static
-from pipeline.desk.student import check_page, my_feedback, plots_page, report_page, submission_page
-from pipeline.desk.users import User, read_users
-from pipeline.desk.visibility import REFUSED
+from pipeline.desk.served_files import clear_scratch, serve_file, serve_static
+from pipeline.desk.student import my_feedback, result_pages, submission_page
+from pipeline.desk.users import REFUSED, User, read_users
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.intake.unpack import HAND_IN
-from pipeline.web import Login, OriginCheck, Served
+from pipeline.web import Login, OriginCheck, Served, refuse
 
 Handler = Callable[[PageRequest], Any]  # returns a Response or a coroutine of one
 
@@ -125,15 +124,15 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/student/{n:nth}/gap/{name:path}", "GET", _serve("gap")),
     ("/student/{n:nth}/stop", "POST", _stop),
     ("/student/{n:nth}/events", "GET", _stream_events),
-    ("/student/{n:nth}/report", "GET", report_page.show),
+    ("/student/{n:nth}/report", "GET", result_pages.show_report),
     ("/student/{n:nth}/report/{name:path}", "GET", _serve("report")),
-    ("/student/{n:nth}/questions", "GET", report_page.show_questions),
-    ("/student/{n:nth}/compare", "GET", plots_page.show),
-    ("/student/{n:nth}/compare", "POST", plots_page.make),
-    ("/student/{n:nth}/answer", "POST", report_page.answer),
-    ("/student/{n:nth}/state-signs", "POST", report_page.state_signs),
-    ("/student/{n:nth}/check", "GET", check_page.show),
-    ("/student/{n:nth}/check", "POST", check_page.begin),
+    ("/student/{n:nth}/questions", "GET", result_pages.show_questions),
+    ("/student/{n:nth}/compare", "GET", result_pages.show_plots),
+    ("/student/{n:nth}/compare", "POST", result_pages.make_plots),
+    ("/student/{n:nth}/answer", "POST", result_pages.answer),
+    ("/student/{n:nth}/state-signs", "POST", result_pages.state_signs),
+    ("/student/{n:nth}/check", "GET", result_pages.show_check),
+    ("/student/{n:nth}/check", "POST", result_pages.begin_check),
     ("/student/{n:nth}/hand-in", "GET", submission_page.show_hand_in),
     ("/student/{n:nth}/hand-in", "POST", submission_page.start_hand_in),
     ("/student/{n:nth}/hand-in.zip", "GET", submission_page.download_hand_in),
@@ -319,3 +318,77 @@ def _explain(desk: Desk) -> Callable[[Request, Exception], Response]:
         return plain_error(ask, what, status=500)
 
     return answer
+
+
+# ----------------------------------------------------------------------------- limits of one person
+
+AT_ONCE = 4  # requests of one person that are answered at the same time
+_WAITING = 24  # further requests of one person that wait for their turn
+# Requests of one person that take no turn: streams, which last as long as a page is open, and
+# buttons that stop something.
+_OTHERS, _WITHOUT_TURN = 12, ("/events", "/stop", "/press")
+_STALLED = 20.0  # s without a byte of the body
+_BUSY = (
+    "Too many of your requests are still being answered. Wait until your uploads and downloads "
+    "end, then load this page again."
+)
+
+
+def limit_each_person(app: ASGIApp, *, stalled: float = _STALLED) -> ASGIApp:
+    """Return an application that answers at most `AT_ONCE` requests of one person at a time.
+
+    Further requests wait; very many are refused with status 429. A guard must have stored the
+    person in `scope["user"]`.
+
+    Parameters
+    ----------
+    stalled : longest time in s without a byte of a request's body.
+    """
+    turns: dict[str, asyncio.Semaphore] = {}
+    begun: Counter[tuple[str, bool]] = Counter()
+
+    async def limited(scope: Scope, receive: Receive, send: Send) -> None:
+        name, takes_turn = scope["user"].name, not scope["path"].endswith(_WITHOUT_TURN)
+        if begun[name, takes_turn] >= (AT_ONCE + _WAITING if takes_turn else _OTHERS):
+            await refuse(_BUSY, status=429)(scope, receive, send)
+            return
+        begun[name, takes_turn] += 1
+        try:
+            if takes_turn:
+                async with turns.setdefault(name, asyncio.Semaphore(AT_ONCE)):
+                    await _with_timeout(app, stalled)(scope, receive, send)
+            else:
+                await _with_timeout(app, stalled)(scope, receive, send)
+        finally:
+            begun[name, takes_turn] -= 1
+
+    return limited
+
+
+def _with_timeout(app: ASGIApp, stalled: float) -> ASGIApp:
+    """Return an application that refuses a request whose body stops arriving."""
+
+    async def timed(scope: Scope, receive: Receive, send: Send) -> None:
+        whole = False
+
+        async def body() -> Message:
+            nonlocal whole
+            if whole:  # what follows is the end of the connection, which may take any time
+                return await receive()
+            try:
+                message = await asyncio.wait_for(receive(), stalled)
+            except TimeoutError:
+                why = f"nothing of your upload arrived for {stalled:g} s; send it again"
+                raise HTTPException(408, why) from None
+            whole = not message.get("more_body", False)
+            return message
+
+        async def answer(message: Message) -> None:
+            # The rest of a body that nobody reads must not keep the connection open.
+            if message["type"] == "http.response.start" and scope["method"] == "POST" and not whole:
+                MutableHeaders(scope=message)["Connection"] = "close"
+            await send(message)
+
+        await app(scope, body, answer)
+
+    return timed

@@ -23,8 +23,7 @@ from pipeline.desk.gradebooks import Gradebooks
 from pipeline.desk.jobs import Job, Jobs, WorkerPool
 from pipeline.desk.navigation import list_links
 from pipeline.desk.parts import leave_out_parts
-from pipeline.desk.users import Place, User, name_place
-from pipeline.desk.visibility import Visibility
+from pipeline.desk.users import Place, User, Visibility, name_place
 from pipeline.errors import ConfigError
 from pipeline.grading.words import points_text
 from pipeline.processes import Failed

@@ -1,7 +1,18 @@
-"""Files and pages that the desk serves, each under the strictest security policy that works."""
+"""Files and pages that the desk serves, each under the strictest security policy that works.
 
+Uploads, and files to download, pass through scratch folders.
+"""
+
+import os
+import platform
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
+import psutil
 from starlette.exceptions import HTTPException
 from starlette.responses import FileResponse, Response
 
@@ -81,3 +92,26 @@ def serve_static(ask: PageRequest) -> Response:
         raise HTTPException(404, "there is no such file")
     kind = _OWN_KINDS[PurePosixPath(name).suffix]
     return Response((TEMPLATES / _STATIC[name]).read_bytes(), media_type=kind)
+
+
+# ---------------------------------------------------------------------------------- scratch folders
+
+# The name contains the computer's name, because a process number of another container has no
+# meaning here.
+_OWN = f"cartlab-{re.sub('[^A-Za-z0-9]+', '', platform.node())}"
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Make a folder for uploads and for files to download; remove it at the end."""
+    with tempfile.TemporaryDirectory(prefix=f"{_OWN}-{os.getpid()}-") as folder:
+        yield Path(folder)
+
+
+def clear_scratch() -> None:
+    """Remove the scratch folders of processes that have ended."""
+    for left in Path(tempfile.gettempdir()).glob(f"{_OWN}-*"):
+        found = re.fullmatch(_OWN + r"-(\d{1,9})-\w+", left.name)
+        if found and not psutil.pid_exists(int(found[1])) and not left.is_symlink():
+            # Folders of another user cannot be removed; they stay.
+            shutil.rmtree(left, ignore_errors=True)

@@ -8,7 +8,7 @@ from html import unescape
 import pytest
 
 from pipeline.desk.app import ROUTES
-from pipeline.desk.student.handin import list_held, list_missing
+from pipeline.desk.student.files import list_held, list_missing
 from pipeline.desk.users import read_users
 from pipeline.errors import ConfigError
 from pipeline.grading.self_check.answers import FILE, read_answers

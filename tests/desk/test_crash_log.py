@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.desk.app import DeskServer
-from pipeline.desk.scratch import clear_scratch, scratch_folder
+from pipeline.desk.served_files import clear_scratch, scratch_folder
 from tests.helpers.desks import Visitor
 from tests.helpers.waiting import PATIENCE, address, started
 

@@ -8,7 +8,7 @@ import pytest
 import tomlkit
 from starlette.exceptions import HTTPException
 
-from pipeline.desk.flow import AT_ONCE, limit_each_person
+from pipeline.desk.app import AT_ONCE, limit_each_person
 from pipeline.desk.users import User
 from tests.helpers.desks import a_submission, at_desk
 

@@ -10,8 +10,7 @@ from contextlib import suppress
 import psutil
 import pytest
 
-from pipeline.desk.app import DeskServer
-from pipeline.desk.flow import AT_ONCE
+from pipeline.desk.app import AT_ONCE, DeskServer
 from pipeline.desk.jobs import _SHORT_WORKERS, _WAITING, Busy, Jobs, WorkerPool
 from pipeline.processes import Failed, LineProcess
 from tests.helpers.desks import Visitor, a_submission, at_desk, some_files, wrongs

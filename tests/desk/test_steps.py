@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.desk.student.steps import StepFacts, find_steps, next_step
+from pipeline.desk.student.submission_view import StepFacts, find_steps, next_step
 
 DONE = {"recordings": 33, "is_valid": True}
 

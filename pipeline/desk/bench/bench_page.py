@@ -3,7 +3,11 @@
 Some modules are imported late, because they load the estimators.
 """
 
-from collections.abc import Mapping
+import json
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
@@ -11,19 +15,29 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.bench.live_page import live_view
-from pipeline.desk.bench.plan_rows import plan_ids, read_plan
-from pipeline.desk.bench.ports import list_ports, read_port
+from pipeline.bench.serial_line import port_names
 from pipeline.desk.benches import BenchSession
+from pipeline.desk.crash_log import find_log
 from pipeline.desk.form_input import read_number, read_whole_number
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import serve_file
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.experiments.information import read_error_goal
-from pipeline.experiments.plan import Recording
-from pipeline.names import read_name
+from pipeline.experiments.plan import (
+    Plan,
+    Recording,
+    load_plan,
+    plan_path,
+    session_time,
+    time_words,
+    what_words,
+)
+from pipeline.names import parameter_names, read_name
+from pipeline.output import write_file
 from pipeline.report.exploration import NAME as DIARY
+from pipeline.simulated.links import running_benches
 from pipeline.submission import Submission, load_submission
-from pipeline.submission.load import file_problem
+from pipeline.submission.load import NAME, file_problem
 from pipeline.words.text import with_symbols
 
 _KINDS = (("step", "Step"), ("sweep", "Sweep"), ("sine", "Dwell"), ("decay", "Decay"))
@@ -208,3 +222,172 @@ def _find_session(ask: PageRequest) -> BenchSession:
     if session is None:
         raise HTTPException(404, "no session was started here")
     return session
+
+
+# -------------------------------------------------------------------------------------------- ports
+
+_KEPT = 200  # folders whose port is remembered
+
+
+@dataclass(frozen=True, kw_only=True)
+class Port:
+    """A port that the user can choose.
+
+    Attributes
+    ----------
+    name : the device at the port, as far as the system knows it.
+    """
+
+    address: str
+    name: str
+
+
+def list_ports(ask: PageRequest) -> list[Port]:
+    """Return the ports at which a person may record, the most likely first.
+
+    The last port used in this folder comes first if it still exists. Ports with a device follow,
+    and then the virtual benches on this computer. On a lab server, only the ports in the list of
+    users are returned.
+    """
+    used = _read_memory().get(str(ask.folder()), "")
+    if ask.user.owns:
+        plugged = [Port(address=name.partition(" (")[0], name=name) for name in port_names()]
+        virtual = [
+            Port(address=one.address, name=f"virtual bench {one.name} ({one.address})")
+            for one in running_benches()
+        ]
+        # A port about which the system knows nothing seldom has a bench, so it comes last.
+        unknown = [port for port in plugged if port.name == port.address]
+        found = [port for port in plugged if port not in unknown] + virtual + unknown
+    else:
+        found = [Port(address=at, name=at) for at in ask.user.ports]
+    if used and ask.user.owns and used not in [port.address for port in found]:
+        found.append(Port(address=used, name=f"{used} (used last, not found now)"))
+        return found
+    return sorted(found, key=lambda port: port.address != used)
+
+
+def read_port(ask: PageRequest) -> str:
+    """Return the port that was typed, or else the one that was chosen; remember it for this folder.
+
+    Raises
+    ------
+    ConfigError : the form has no port, or one that is not listed for this person.
+    """
+    port = ask.text("other") or ask.text("port")
+    if not port:
+        raise ConfigError("choose the port of the bench, or type one such as COM3 or /dev/ttyACM0")
+    if not ask.user.owns and port not in ask.user.ports:
+        raise ConfigError(
+            f"{port}: is not one of your ports, which are {', '.join(ask.user.ports)}"
+        )
+    _remember(ask.folder(), port)
+    return port
+
+
+def _remember(folder: Path, port: str) -> None:
+    ports = {at: used for at, used in _read_memory().items() if at != str(folder)}
+    kept = dict(list(ports.items())[1 - _KEPT :]) | {str(folder): port}
+    with suppress(OSError):  # the home folder is not writable: nothing is remembered
+        write_file(_find_memory(), json.dumps(kept, indent=1), private=True)
+
+
+def _read_memory() -> dict[str, str]:
+    """Return the last port used in each folder; the folder used last comes last."""
+    try:
+        read = json.loads(_find_memory().read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    pairs: Sequence[tuple[object, object]] = list(read.items()) if isinstance(read, dict) else []
+    return {str(folder): str(port) for folder, port in pairs}
+
+
+def _find_memory() -> Path:
+    return find_log().with_suffix(".ports.json")
+
+
+# ----------------------------------------------------------------------------------------- the plan
+
+
+def plan_ids(folder: Path) -> frozenset[str] | None:
+    """Return the ids of the recordings in a folder's plan; None if it has no readable plan."""
+    try:
+        submission = load_submission(folder)
+        if plan_path(submission).exists():
+            return frozenset(one.id for one in load_plan(submission).recordings)
+    except PipelineError:
+        pass
+    return None
+
+
+def read_plan(
+    folder: Path, *, session: BenchSession | None, before: Collection[str] | None
+) -> dict[str, Any]:
+    """Return what the page shows of the plan: its rows, the time still needed, what is wrong.
+
+    Parameters
+    ----------
+    session : the last session in the folder; it knows why a run ended early.
+    before : ids of the recordings that the plan had before the latest addition; None if no
+        recording is new.
+    """
+    found = {"sound": False, "rows": [], "left": "", "wrong": "", "units": None, "parameters": []}
+    found |= {"carts": 0, "recorded": 0}
+    if not (folder / NAME).exists():
+        return found
+    try:
+        submission = load_submission(folder)
+        system = submission.system
+        names = parameter_names(system.carts, rigid=not system.bench.tied)
+        found |= {
+            "sound": True,
+            "carts": system.carts,
+            "recorded": len(submission.experiments),
+            "units": {"input": system.input.unit, "position": system.position.unit},
+            "parameters": [(name, f"the {read_name(name).words}") for name in names],
+        }
+        if not plan_path(submission).exists():
+            return found
+        plan = load_plan(submission)
+    except PipelineError as error:
+        return found | {"sound": False, "wrong": str(error)}
+    why = _why_again(session)
+    return found | _describe(plan, submission, why=why, before=before)
+
+
+def _describe(
+    plan: Plan,
+    submission: Submission,
+    *,
+    why: Mapping[str, str],
+    before: Collection[str] | None,
+) -> dict[str, Any]:
+    """Return a row for each recording, and the total time of the recordings still to make."""
+    done = {experiment.id for experiment in submission.experiments}
+    left = [recording for recording in plan.recordings if recording.id not in done]
+    following = left[0].id if left else ""
+    rows = [
+        {
+            "id": one.id,
+            "what": what_words(one, submission),
+            "done": one.id in done,
+            "next": one.id == following,
+            "new": before is not None and one.id not in before,
+            "why": "" if one.id in done else why.get(one.id, _find_partial(submission, one.id)),
+        }
+        for one in plan.recordings
+    ]
+    return {"rows": rows, "left": time_words(session_time(left)) if left else ""}
+
+
+def _why_again(session: BenchSession | None) -> dict[str, str]:
+    """Return, by id, why a run of the last session must be repeated."""
+    plan = session.snapshot().get("plan", ()) if session else ()
+    return {entry["id"]: f"It ended early: {entry['why']}." for entry in plan if entry["why"]}
+
+
+def _find_partial(submission: Submission, name: str) -> str:
+    """Return a note if an earlier run of this recording ended early, else ""."""
+    file = f"data/{name}.partial.txt"
+    is_there = file_problem(submission.folder, file) is None
+    return f"An earlier run ended early; what it recorded is in {file}." if is_there else ""

@@ -13,7 +13,7 @@ from pipeline.desk.grades.class_table import show as show_class
 from pipeline.desk.grades.grading_form import grade_again, show_unfinished
 from pipeline.desk.grades.team_page import sign
 from pipeline.desk.page_request import PageRequest
-from pipeline.desk.scratch import scratch_folder
+from pipeline.desk.served_files import scratch_folder
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.decisions import read_wishes
 from pipeline.grading.platforms import PLATFORMS

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any
 
-from pipeline.desk.evidence import show_message, show_numbers
+from pipeline.desk.shown_criterion import show_message, show_numbers
 from pipeline.grading.grade import Criterion, Flag, Grade
 from pipeline.grading.gradebook.entry import Entry, Event
 from pipeline.grading.publish.feedback import TONES, alternative, evidence_table, sentence

@@ -16,7 +16,7 @@ from pipeline.desk.home import enter
 from pipeline.desk.instructor.rubric_list import own_rubrics, shipped_rubrics
 from pipeline.desk.jobs import Busy
 from pipeline.desk.page_request import PageRequest
-from pipeline.desk.scratch import scratch_folder
+from pipeline.desk.served_files import scratch_folder
 from pipeline.desk.users import Place, User, name_place
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.grade_class import refuse_submission

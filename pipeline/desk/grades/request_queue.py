@@ -11,7 +11,7 @@ from pipeline.desk.grades.class_table import find_signature, find_team, open_gra
 from pipeline.desk.grades.criteria import list_steps
 from pipeline.desk.grades.team_page import sign
 from pipeline.desk.page_request import PageRequest
-from pipeline.desk.request_steps import describe_steps
+from pipeline.desk.shown_criterion import describe_steps
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.decisions import MOST_LETTERS, Conflict, RequestRefused, read_points
 from pipeline.grading.gradebook.entry import Entry, Request

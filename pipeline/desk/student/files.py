@@ -1,8 +1,10 @@
-"""Store uploaded files in `data/`, within the limits of a hand-in; never overwrite another file.
+"""The files of a submission: uploads, within the limits of a hand-in, and what is handed in.
 
-Only workers read the files; the desk itself copies their bytes.
+An upload never overwrites another file. Only workers read the files; the desk itself copies their
+bytes.
 """
 
+import os
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
@@ -11,15 +13,17 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from pipeline.desk.jobs import WorkerPool
+from pipeline.desk.last_report import NOTES, find_state
 from pipeline.desk.page_request import Message
-from pipeline.desk.scratch import scratch_folder
-from pipeline.desk.student.handin import BESIDE
+from pipeline.desk.served_files import scratch_folder
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.unpack import HAND_IN, is_debris, unpack
+from pipeline.grading.self_check.log import FILE as CHECKS
 from pipeline.ingest.files import ENDINGS
 from pipeline.lock import lock_when_free
 from pipeline.output import own_folder, write_file
 from pipeline.processes import Failed
+from pipeline.submission import load_submission
 from pipeline.submission.load import (
     MAX_DATA_BYTES,
     MAX_NOTES_BYTES,
@@ -208,3 +212,51 @@ def _is_sound(folder: Path, name: str) -> bool:
     except SubmissionError:
         return False
     return True
+
+
+# ----------------------------------------------------------------------------- the files to hand in
+
+_REPORT = "report/report.pdf"
+BESIDE = (NOTES, CHECKS, _REPORT)
+_MADE = ("report", "gap", "solution")  # folders of computed results, which contain no recordings
+
+
+def list_held(folder: Path, *, report: bool = True) -> list[str]:
+    """Return the names of the files in the zip.
+
+    Raises
+    ------
+    SubmissionError : the submission is not valid.
+    """
+    named = [experiment.file for experiment in load_submission(folder).experiments]
+    files = [file for file in named if not _is_made(folder, file)]
+    return list(dict.fromkeys([NAME, *files, *list_beside(folder, report=report)]))
+
+
+def list_beside(folder: Path, *, report: bool = True) -> list[str]:
+    """Return which files of `BESIDE` go into the zip; an outdated report is left out."""
+    left_out = "" if report and find_state(folder) == "current" else _REPORT
+    return [name for name in BESIDE if name != left_out and file_problem(folder, name) is None]
+
+
+def list_missing(folder: Path) -> list[str]:
+    """Return the reasons why a submission cannot be handed in."""
+    try:
+        submission = load_submission(folder)
+    except SubmissionError as error:
+        return [str(error)]
+    files = dict.fromkeys(experiment.file for experiment in submission.experiments)
+    found = [problem for file in files if (problem := file_problem(folder, file)) is not None]
+    found += [
+        f"{file} is computed from recordings; use the recording itself"
+        for file in files
+        if _is_made(folder, file)
+    ]
+    return found or ([] if files else ["it has no experiments yet"])
+
+
+def _is_made(folder: Path, name: str) -> bool:
+    """Return whether a file, or the target of its link, is in a folder of computed results."""
+    root = folder.resolve()
+    places = (Path(os.path.normpath(root / name)), (folder / name).resolve())
+    return any(place.is_relative_to(root / made) for place in places for made in _MADE)

@@ -14,7 +14,8 @@ import tomlkit
 
 from pipeline.desk import last_report
 from pipeline.desk.last_report import NOTES, read_findings, read_notes
-from pipeline.desk.student import check_state, files
+from pipeline.desk.student import files
+from pipeline.desk.student.files import list_held, list_missing
 from pipeline.desk.student.form import (
     Fault,
     clear_marks,
@@ -22,15 +23,16 @@ from pipeline.desk.student.form import (
     sign_fields,
     write_fields,
 )
-from pipeline.desk.student.handin import list_held, list_missing
 from pipeline.desk.toml_form import Field
 from pipeline.errors import SubmissionError
+from pipeline.grading.self_check.log import CheckAnswer, find_basis, read_answers
+from pipeline.grading.self_check.words import asked_words, hint_words, number_words, result_words
 from pipeline.identify.springs import find_springs
 from pipeline.ingest.fill import UNSURE, data_files, experiment_doubts, system_doubts
 from pipeline.lock import lock_when_free
 from pipeline.output import write_file
 from pipeline.report.sections.notes import with_answer, written_answer
-from pipeline.submission import load_submission
+from pipeline.submission import Submission, load_submission
 from pipeline.submission.edit import (
     Stale,
     edit_submission,
@@ -117,7 +119,7 @@ def read_folder(folder: str, check: bool, *, progress: Progress) -> dict[str, An
         "doubts": _list_doubts(place) if UNSURE in text else None,
         "keeps": list_missing(place),
         "unanswered": [] if check else list_unanswered(place),
-        "checked": check_state.find_check_state(place) if check else None,
+        "checked": _find_check_state(place) if check else None,
     }
 
 
@@ -222,7 +224,7 @@ def set_aside(folder: str, file: str, *, progress: Progress) -> str | None:
 
 
 def list_hand_in(folder: str, report: bool, *, progress: Progress) -> list[tuple[str, int]]:
-    """Return name and size of each file that would be handed in; see `handin.list_held`."""
+    """Return name and size of each file that would be handed in; see `list_held`."""
     held = list_held(Path(folder), report=report)
     return [(name, (Path(folder) / name).stat().st_size) for name in held]
 
@@ -252,11 +254,6 @@ def pack_hand_in(
                 while chunk := file.read(1 << 20):
                     packed.write(chunk)
     return made_of
-
-
-def describe_check(folder: str, *, progress: Progress) -> dict[str, Any]:
-    """Return what the page of the check shows; see `check_state.describe`."""
-    return check_state.describe(Path(folder))
 
 
 def read_questions(folder: str, ids: Sequence[str], *, progress: Progress) -> dict[str, Any]:
@@ -299,6 +296,88 @@ def answer_question(
             raise SubmissionError(f"{NOTES} would exceed {MAX_NOTES_BYTES:,} bytes")
         write_file(place / NOTES, new)
     return {}
+
+
+# -------------------------------------------------------------------- the check of reported numbers
+
+
+def _find_check_state(folder: Path) -> tuple[str, str]:
+    """Return the state of the check (done, needs, old or none), and a word for it."""
+    submission, problems = _load_if_sound(folder)
+    try:
+        answers = read_answers(folder)
+    except SubmissionError:
+        return "needs", "cannot be read"
+    if problems or not answers or submission is None:
+        return "none", "not run yet"
+    last = answers[-1]
+    if last.basis != find_basis(submission):
+        return "old", "changed since"
+    return ("needs", "some disagree") if last.disagree else ("done", "all agree")
+
+
+def describe_check(folder: str, *, progress: Progress) -> dict[str, Any]:
+    """Return the last answer, and what the student can ask next, as the page of the check shows it.
+
+    An answer about earlier numbers or an earlier set-up is not shown, only that there is one.
+    """
+    place = Path(folder)
+    submission, problems = _load_if_sound(place)
+    answers: Sequence[CheckAnswer] = ()
+    try:
+        answers = read_answers(place)
+    except SubmissionError as error:
+        problems.append(str(error))
+    last = answers[-1] if answers else None
+    current = last if last and submission and last.basis == find_basis(submission) else None
+    return {
+        "problems": problems,
+        "ready": submission is not None and submission.reported is not None,
+        "last": last is not None,
+        "result": result_words(current) if current else "",
+        "rows": _describe_rows(current, answers, submission) if current and submission else [],
+        "agree": [number_words(number) for number in current.agree] if current else [],
+        "not_checked": [number_words(number) for number in current.not_checked] if current else [],
+        "unread": list(current.unread) if current else [],
+        "doubtful": list(current.doubtful) if current else [],
+        "asked": asked_words(len(answers)) if answers else "",
+    }
+
+
+def _load_if_sound(folder: Path) -> tuple[Submission | None, list[str]]:
+    """Return the submission, or None with what is wrong with it."""
+    try:
+        return load_submission(folder), []
+    except SubmissionError as error:
+        return None, [str(error)]
+
+
+def _describe_rows(
+    current: CheckAnswer, answers: Sequence[CheckAnswer], submission: Submission
+) -> list[dict[str, Any]]:
+    """Return a row for each number that disagrees, with its hint if there is one."""
+    hints = {
+        hint.number: asdict(hint_words(hint))
+        for answer in answers
+        if answer.basis == current.basis
+        for hint in answer.hints
+    }
+    return [
+        {
+            "number": number,
+            "name": number_words(number),
+            "typed": _find_typed(number, submission),
+            "hint": hints.get(number),
+        }
+        for number in current.disagree
+    ]
+
+
+def _find_typed(number: str, submission: Submission) -> str:
+    """Return an initial or final estimate as typed; "" for any other number."""
+    table, _, name = number.partition(".")
+    typed = submission.typed.get(table, {}).get(name)
+    return "" if typed is None else str(typed)
 
 
 FOLDER_TASKS = (

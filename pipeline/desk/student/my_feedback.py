@@ -5,12 +5,10 @@ from typing import Any
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from pipeline.desk.evidence import show_evidence
 from pipeline.desk.page_request import PageRequest
-from pipeline.desk.request_steps import describe_steps
 from pipeline.desk.served_files import show_own_page
-from pipeline.desk.users import OwnGrade
-from pipeline.desk.visibility import REFUSED
+from pipeline.desk.shown_criterion import describe_steps, show_evidence
+from pipeline.desk.users import REFUSED, OwnGrade
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion
 from pipeline.grading.gradebook.decisions import MOST_LETTERS, RequestRefused, points_lost

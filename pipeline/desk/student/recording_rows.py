@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.desk.page_request import NOTHING_KNOWN, PageRequest
-from pipeline.desk.student.form import count_carts, fill_experiment, is_marked, is_of_loop
-from pipeline.desk.student.set_up import ask_held
+from pipeline.desk.student.form import ask_held, count_carts, fill_experiment, is_marked, is_of_loop
 from pipeline.desk.toml_form import Answer, Field
 from pipeline.ingest.inspect import NO_CLOCK
 from pipeline.submission.edit import text_digest

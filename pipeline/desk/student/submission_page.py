@@ -16,7 +16,7 @@ from starlette.types import Receive, Scope, Send
 from pipeline.desk import last_report
 from pipeline.desk.form_input import read_whole_number
 from pipeline.desk.page_request import Message, PageRequest
-from pipeline.desk.scratch import scratch_folder
+from pipeline.desk.served_files import scratch_folder
 from pipeline.desk.student.files import take_uploads
 from pipeline.desk.student.form import Fault, fill_experiment, fill_form
 from pipeline.desk.student.recording_rows import (

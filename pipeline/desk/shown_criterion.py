@@ -1,11 +1,37 @@
-"""The events of a request for a review, as students and TAs read them."""
+"""What TAs and students both see of a criterion: its evidence, and the steps of a request."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import count
 
+from pipeline.grading.grade import Criterion
 from pipeline.grading.gradebook.entry import Event, hide_people
 from pipeline.grading.gradebook.history import to_the_second
+from pipeline.grading.publish.feedback import numbers_table, sentence
 from pipeline.grading.words import points_text
+from pipeline.report.document import paragraph
+from pipeline.report.render.html import render_blocks
+from pipeline.setup import Units
+from pipeline.words.text import rich
+
+
+def show_evidence(criterion: Criterion, check: str, units: Units | None) -> str:
+    """Return the message, and the reported numbers next to the recomputed ones, as HTML."""
+    return show_message(criterion) + show_numbers(criterion, check, units)
+
+
+def show_message(criterion: Criterion) -> str:
+    """Return the message of a criterion as HTML."""
+    return render_blocks([paragraph(rich(sentence(criterion.message)))])
+
+
+def show_numbers(criterion: Criterion, check: str, units: Units | None) -> str:
+    """Return the reported numbers next to the recomputed ones as HTML; "" without numbers."""
+    table = numbers_table(criterion, check=check, units=units, numbers=count(0))
+    return render_blocks([table]) if table else ""
+
+
+# ----------------------------------------------------------------------------------------- requests
 
 _HEADS = {
     "asked": "asked",

@@ -1,11 +1,13 @@
-"""The report in the student's room, and its questions, which are answered in `notes.md`."""
+"""What the desk made of a submission: the report and its questions, the plots, and the check."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode
 
 from starlette.responses import Response
 
-from pipeline.desk.last_report import NOTES, read_findings
+from pipeline.desk.last_report import NOTES, PLOTS, plots_are_current, read_findings
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.student.form import sign_fields
 from pipeline.desk.student.submission_view import StalePage, SubmissionView, read_room, show_stale
@@ -40,7 +42,7 @@ class QuestionsPage:
     seen: str
 
 
-def show(ask: PageRequest) -> Response:
+def show_report(ask: PageRequest) -> Response:
     """Show the report in a window below the steps."""
     folder = ask.folder()
     there = file_problem(folder, "report/report.html") is None
@@ -139,3 +141,111 @@ def _list_signs(room: SubmissionView) -> str:
     for field in sign_fields(document, signs):
         open_.setdefault(field.value, []).append(tables[int(field.path.split(".")[1])]["id"])
     return "; ".join(f"{sign} in {join_names(runs)}" for sign, runs in open_.items())
+
+
+# -------------------------------------------------------------------------------- the plots
+
+_PLOTS = "make_plots"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlotsPage:
+    """What the page of plots shows.
+
+    Attributes
+    ----------
+    busy : whether a job is running in the folder.
+    plots : address of the plots; "" if they are missing or out of date.
+    again : address of this page, which keeps the chosen recording.
+    failed : whether the last attempt to make the plots failed.
+    """
+
+    room: SubmissionView
+    busy: bool
+    plots: str
+    again: str
+    failed: bool
+
+
+def show_plots(ask: PageRequest) -> Response:
+    """Show the plots; if they are missing or out of date, show the job or a button to start it."""
+    room, chosen = read_room(ask), _choose(ask)
+    again = f"{ask.here}compare{chosen and '?' + chosen}"
+    # Read the job before the plots. If it ends in between, the page shows it as running, and asks
+    # again.
+    job, busy = ask.desk.jobs.of(ask.folder()), _is_busy(ask)
+    there = not busy and plots_are_current(ask.folder())
+    if there and ask.request.headers.get("hx-request"):
+        return ask.go(again)  # plots need a page of another width
+    page = PlotsPage(
+        room=room,
+        busy=busy,
+        plots=f"{ask.here}{PLOTS}{chosen and '#' + chosen}" if there else "",
+        again=again,
+        failed=job is not None and job.task[0] == _PLOTS and job.state in ("failed", "stopped"),
+    )
+    return ask.page("plots", title=f"Plots of {ask.folder().name}", page=page)
+
+
+def make_plots(ask: PageRequest) -> Response:
+    """Start the task that makes the plots, unless they are up to date."""
+    if not _is_busy(ask) and not plots_are_current(ask.folder()):
+        ask.start(_PLOTS, title="The plots")
+    chosen = _choose(ask)
+    return ask.back(f"{ask.here}compare{chosen and '?' + chosen}")
+
+
+def _choose(ask: PageRequest) -> str:
+    """Return the recording that the URL names, as part of a URL; "" if it names none."""
+    run = ask.query("run")
+    return urlencode({"run": run}) if run else ""
+
+
+def _is_busy(ask: PageRequest) -> bool:
+    job = ask.desk.jobs.of(ask.folder())
+    return job is not None and not job.over
+
+
+# -------------------------------------------------------------------------------- the check
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckPage:
+    """What the page of the check shows: the submission, and `describe_check`."""
+
+    room: SubmissionView
+    busy: bool
+    problems: Sequence[str]
+    ready: bool
+    last: bool
+    result: str
+    rows: Sequence[Mapping[str, Any]]
+    agree: Sequence[str]
+    not_checked: Sequence[str]
+    unread: Sequence[str]
+    doubtful: Sequence[str]
+    asked: str
+
+
+def show_check(ask: PageRequest) -> Response:
+    """Show the last answer, and what the student can ask next."""
+    folder = ask.folder()
+    # Read the job before the answers. If a check ends in between, the page then shows it as running
+    # and asks again, instead of showing earlier answers as the result.
+    job = ask.desk.jobs.of(folder)
+    busy = job is not None and not job.over
+    found = ask.desk.workers.do("describe_check", folder=str(folder))
+    page = CheckPage(room=read_room(ask), busy=busy, **found)
+    return ask.page("check", title=f"Check of {folder.name}", page=page)
+
+
+def begin_check(ask: PageRequest) -> Response:
+    """Start a check of all numbers, or ask where to look for one number."""
+    number, rubric = ask.text("number"), ask.user.rubric
+    ask.start(
+        "check_numbers",
+        title="The check",
+        rubric=str(rubric) if rubric else "",
+        where=[number] if number else [],
+    )
+    return ask.back(f"{ask.here}check")
