@@ -1,15 +1,17 @@
 """The first page: what a person can do, the state of what is open, and folders to choose from."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from starlette.responses import RedirectResponse, Response
 
-from pipeline.desk.browse import MOST, list_folders
+from pipeline.desk.browse import MOST, FolderList, list_folders
 from pipeline.desk.form_input import read_path
 from pipeline.desk.jobs import Job
 from pipeline.desk.last_report import find_state
-from pipeline.desk.navigation import list_feedback
+from pipeline.desk.navigation import NavLink, list_feedback
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.users import Place, User, name_place
 from pipeline.errors import ConfigError, PipelineError
@@ -22,6 +24,81 @@ _MADE = 3  # exercises listed on the first page
 _ROOMS = ("student", "bench", "solution")
 
 
+@dataclass(frozen=True, kw_only=True)
+class OpenSubmission:
+    """A submission on the first page: its number, its files, and what is made of it.
+
+    Attributes
+    ----------
+    report : state of the report; see `last_report.find_state`.
+    """
+
+    n: int
+    name: str
+    folder: Path
+    files: int
+    report: str
+    is_recording: bool
+    has_plan: bool
+    has_solution: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenClass:
+    """A class on the first page; all numbers are 0 if it cannot be read, or is not graded yet.
+
+    Attributes
+    ----------
+    is_running : whether a task is running in its folder.
+    teams, seen : number of its teams, and of those that were reviewed.
+    """
+
+    n: int
+    name: str
+    place: Place
+    is_running: bool
+    teams: int
+    seen: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class HomePage:
+    """What the first page shows.
+
+    Attributes
+    ----------
+    made : the jobs of the last exercises.
+    start : the folder that is typed in advance.
+    to : the room for which a folder is chosen; "" for any.
+    """
+
+    submissions: Sequence[OpenSubmission]
+    classes: Sequence[OpenClass]
+    made: Sequence[Job]
+    feedback: Sequence[NavLink]
+    start: Path
+    to: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoldersPage:
+    """The folders to choose from.
+
+    Attributes
+    ----------
+    to : the room for which a folder is chosen; "" for any.
+    """
+
+    folders: FolderList
+    to: str
+    most: int = MOST
+
+    @property
+    def start(self) -> Path:
+        """The folder that is typed in advance."""
+        return self.folders.here.path
+
+
 def show_home(ask: PageRequest) -> Response:
     """Show what a person can do here; a person with only one place is taken to it."""
     user = ask.user
@@ -29,29 +106,21 @@ def show_home(ask: PageRequest) -> Response:
     rooms = [room for room, listed in places.items() for _ in listed]
     if len(rooms) == 1 and not user.owns:
         return RedirectResponse(f"/{rooms[0]}/0/", status_code=303)
-    return ask.page(
-        "home",
-        title="cartlab",
+    page = HomePage(
         submissions=[_describe_submission(ask, n, p) for n, p in enumerate(user.folders)],
         classes=[_describe_class(ask, n, place) for n, place in enumerate(user.gradebooks)],
         made=_list_made(ask),
         feedback=list_feedback(user),
         start=ask.desk.root,
-        to="",
     )
+    return ask.page("home", title="cartlab", page=page)
 
 
 def show_folders(ask: PageRequest) -> Response:
     """Show the list of folders to choose from."""
     to, folders = ask.text("to"), list_folders(ask.desk.root, ask.text("in"))
-    return ask.page(
-        "folders",
-        title="Choose a folder",
-        folders=folders,
-        start=folders.here.path,
-        most=MOST,
-        to=to if to in _ROOMS else "",
-    )
+    page = FoldersPage(folders=folders, to=to if to in _ROOMS else "")
+    return ask.page("folders", title="Choose a folder", page=page)
 
 
 def open_place(ask: PageRequest) -> Response:
@@ -106,7 +175,7 @@ def _list_made(ask: PageRequest) -> list[Job]:
     return seen[:_MADE]
 
 
-def _describe_submission(ask: PageRequest, n: int, folder: Path) -> dict[str, Any]:
+def _describe_submission(ask: PageRequest, n: int, folder: Path) -> OpenSubmission:
     """Return the state of a submission: its files, report, recordings and solution."""
     session, data = ask.desk.benches.of(folder), folder / "data"
     try:
@@ -115,33 +184,30 @@ def _describe_submission(ask: PageRequest, n: int, folder: Path) -> dict[str, An
         report = find_state(folder) if folder.is_dir() else "unreadable"
     except OSError:  # the desk may not read it, or its disk is not connected
         files, report = 0, "unreadable"
-    return {
-        "n": n,
-        "name": name_place(folder),
-        "folder": folder,
-        "files": files,
-        "report": report,
-        "is_recording": session is not None and not session.ended.is_set(),
-        "has_plan": file_problem(folder, PLAN) is None,
-        "has_solution": file_problem(folder, "solution/solution.html") is None,
-    }
+    return OpenSubmission(
+        n=n,
+        name=name_place(folder),
+        folder=folder,
+        files=files,
+        report=report,
+        is_recording=session is not None and not session.ended.is_set(),
+        has_plan=file_problem(folder, PLAN) is None,
+        has_solution=file_problem(folder, "solution/solution.html") is None,
+    )
 
 
-def _describe_class(ask: PageRequest, n: int, place: Place) -> dict[str, Any]:
-    """Return the state of a class: whether work is running there, and how many were reviewed.
-
-    All numbers are 0 if the class cannot be read, or is not graded yet.
-    """
+def _describe_class(ask: PageRequest, n: int, place: Place) -> OpenClass:
+    """Return the state of a class: whether work is running there, and how many were reviewed."""
     try:
         teams = ask.desk.gradebooks.of(place).now.rows
     except (PipelineError, OSError):
         teams = ()
     job = ask.desk.jobs.of(place) if isinstance(place, Path) else None
-    return {
-        "n": n,
-        "name": name_place(place),
-        "place": place,
-        "is_running": job is not None and not job.over,
-        "teams": len(teams),
-        "seen": sum(1 for team in teams if team.reviewed_by),
-    }
+    return OpenClass(
+        n=n,
+        name=name_place(place),
+        place=place,
+        is_running=job is not None and not job.over,
+        teams=len(teams),
+        seen=sum(1 for team in teams if team.reviewed_by),
+    )

@@ -100,7 +100,7 @@ def test_the_next_desk_removes_the_files_of_a_killed_one(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     code = (
         "import sys, tempfile; tempfile.tempdir = sys.argv[1]\n"
-        "from pipeline.desk.scratch import scratch_folder\n"
+        "from pipeline.desk.served_files import scratch_folder\n"
         "with scratch_folder() as folder:\n"
         "    (folder / 'upload.zip').write_bytes(b'x'); print(folder, flush=True); input()"
     )

@@ -6,7 +6,7 @@ Some modules are imported late, because they load the estimators.
 import json
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,73 @@ from pipeline.words.text import with_symbols
 
 _KINDS = (("step", "Step"), ("sweep", "Sweep"), ("sine", "Dwell"), ("decay", "Decay"))
 _TYPED = ("kind", "amplitude", "frequency", "frequency_end", "seconds", "cart", "goal")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Port:
+    """A port that the user can choose.
+
+    Attributes
+    ----------
+    name : the device at the port, as far as the system knows it.
+    """
+
+    address: str
+    name: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanView:
+    """What the page shows of the plan.
+
+    Attributes
+    ----------
+    sound : whether the submission and its plan can be read; `wrong` says why not.
+    rows : the recordings of the plan.
+    left : the time still needed; "" if nothing is left to record.
+    units : the units of input and position; None without a readable submission.
+    parameters : name and words of each parameter of the bench.
+    recorded : number of recordings in the submission.
+    """
+
+    sound: bool = False
+    wrong: str = ""
+    rows: Sequence[Mapping[str, Any]] = ()
+    left: str = ""
+    units: Mapping[str, str] | None = None
+    parameters: Sequence[tuple[str, str]] = ()
+    carts: int = 0
+    recorded: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchPage:
+    """What the page of the bench shows.
+
+    Attributes
+    ----------
+    session : the last session in the folder.
+    asks : whether a session waits for the bench to answer.
+    live : the view of the session while it runs.
+    kind, typed : the kind and the fields of the form for a custom recording.
+    kind_asked : whether the person chose that kind.
+    refused : why the custom recording is not possible.
+    weighed : its predicted benefit.
+    """
+
+    plan: PlanView
+    session: BenchSession | None
+    asks: bool
+    live: str
+    ports: Sequence[Port]
+    has_report: bool
+    diary: bool
+    kind: str
+    kind_asked: bool
+    typed: Mapping[str, str]
+    refused: str
+    weighed: Mapping[str, Any] | None
+    kinds: Sequence[tuple[str, str]] = _KINDS
 
 
 def show(ask: PageRequest) -> Response:
@@ -150,24 +217,21 @@ def _show_page(
     session = ask.desk.benches.of(folder)
     running = session if session and not session.ended.is_set() else None
     kind = typed.get("kind") or ask.query("kind")
-    return ask.page(
-        "bench",
-        status=status,
-        title=f"{folder.name} at the bench",
+    page = BenchPage(
+        plan=read_plan(folder, session=session, before=ask.desk.benches.planned.get(folder)),
         session=session,
-        asks=running and not running.is_shown,
+        asks=running is not None and not running.is_shown,
         live=Markup(live_view()) if running and running.is_shown else "",
         ports=list_ports(ask),
         has_report=file_problem(folder, "report/report.html") is None,
-        kinds=_KINDS,
         kind=kind if kind in dict(_KINDS) else _KINDS[0][0],
         kind_asked=bool(ask.query("kind")),
         diary=file_problem(folder, DIARY) is None,
         typed={name: typed.get(name, "") for name in _TYPED},
         refused=refused,
         weighed=weighed,
-        **read_plan(folder, session=session, before=ask.desk.benches.planned.get(folder)),
     )
+    return ask.page("bench", status=status, title=f"{folder.name} at the bench", page=page)
 
 
 def _note_plan(ask: PageRequest) -> None:
@@ -227,19 +291,6 @@ def _find_session(ask: PageRequest) -> BenchSession:
 # -------------------------------------------------------------------------------------------- ports
 
 _KEPT = 200  # folders whose port is remembered
-
-
-@dataclass(frozen=True, kw_only=True)
-class Port:
-    """A port that the user can choose.
-
-    Attributes
-    ----------
-    name : the device at the port, as far as the system knows it.
-    """
-
-    address: str
-    name: str
 
 
 def list_ports(ask: PageRequest) -> list[Port]:
@@ -322,7 +373,7 @@ def plan_ids(folder: Path) -> frozenset[str] | None:
 
 def read_plan(
     folder: Path, *, session: BenchSession | None, before: Collection[str] | None
-) -> dict[str, Any]:
+) -> PlanView:
     """Return what the page shows of the plan: its rows, the time still needed, what is wrong.
 
     Parameters
@@ -331,28 +382,29 @@ def read_plan(
     before : ids of the recordings that the plan had before the latest addition; None if no
         recording is new.
     """
-    found = {"sound": False, "rows": [], "left": "", "wrong": "", "units": None, "parameters": []}
-    found |= {"carts": 0, "recorded": 0}
     if not (folder / NAME).exists():
-        return found
+        return PlanView()
     try:
         submission = load_submission(folder)
-        system = submission.system
-        names = parameter_names(system.carts, rigid=not system.bench.tied)
-        found |= {
-            "sound": True,
-            "carts": system.carts,
-            "recorded": len(submission.experiments),
-            "units": {"input": system.input.unit, "position": system.position.unit},
-            "parameters": [(name, f"the {read_name(name).words}") for name in names],
-        }
-        if not plan_path(submission).exists():
-            return found
-        plan = load_plan(submission)
     except PipelineError as error:
-        return found | {"sound": False, "wrong": str(error)}
-    why = _why_again(session)
-    return found | _describe(plan, submission, why=why, before=before)
+        return PlanView(wrong=str(error))
+    system = submission.system
+    names = parameter_names(system.carts, rigid=not system.bench.tied)
+    found = PlanView(
+        sound=True,
+        carts=system.carts,
+        recorded=len(submission.experiments),
+        units={"input": system.input.unit, "position": system.position.unit},
+        parameters=[(name, f"the {read_name(name).words}") for name in names],
+    )
+    try:
+        plan = load_plan(submission) if plan_path(submission).exists() else None
+    except PipelineError as error:
+        return replace(found, sound=False, wrong=str(error))
+    if plan is None:
+        return found
+    rows, left = _describe(plan, submission, why=_why_again(session), before=before)
+    return replace(found, rows=rows, left=left)
 
 
 def _describe(
@@ -361,7 +413,7 @@ def _describe(
     *,
     why: Mapping[str, str],
     before: Collection[str] | None,
-) -> dict[str, Any]:
+) -> tuple[list[dict[str, Any]], str]:
     """Return a row for each recording, and the total time of the recordings still to make."""
     done = {experiment.id for experiment in submission.experiments}
     left = [recording for recording in plan.recordings if recording.id not in done]
@@ -377,7 +429,7 @@ def _describe(
         }
         for one in plan.recordings
     ]
-    return {"rows": rows, "left": time_words(session_time(left)) if left else ""}
+    return rows, time_words(session_time(left)) if left else ""
 
 
 def _why_again(session: BenchSession | None) -> dict[str, str]:

@@ -1,6 +1,7 @@
 """The instructor's room: exercises with hidden effects, solutions, and the catalogue of effects."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -11,17 +12,83 @@ from starlette.responses import RedirectResponse, Response
 from pipeline.desk.browse import free_path
 from pipeline.desk.exercises import SLIDE
 from pipeline.desk.form_input import keep_refusal, read_path, read_whole_number
+from pipeline.desk.jobs import Job
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
 from pipeline.output import new_folder
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
+from pipeline.plant.effect import Effect
 from pipeline.report.effect_texts import catalogue_data
 from pipeline.submission.load import NAME, file_problem
 from pipeline.words.math import to_text
 
 _SHOWN_ON = "throne-2dof"  # the smallest bench with a spring between two carts
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExercisesPage:
+    """The form of an exercise, as filled in.
+
+    Attributes
+    ----------
+    bench : the bench as typed.
+    found : the worker's check of the bench and its effects.
+    shown : each chosen effect, with the address of its picture.
+    wrong : why a field was refused, by name of the field.
+    """
+
+    bench: Mapping[str, str]
+    found: Mapping[str, Any]
+    shown: Sequence[tuple[Mapping[str, Any], str]]
+    out: str
+    folders: str
+    seed: str
+    reported: bool
+    wrong: Mapping[str, str]
+    presets: Sequence[str] = tuple(sorted(PRESETS))
+    catalogue: Sequence[Effect] = CATALOGUE
+    slide: float = SLIDE
+
+    @property
+    def chosen(self) -> list[str]:
+        """The keys of the chosen effects."""
+        return [effect["key"] for effect, _ in self.shown]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MadePage:
+    """The progress of an exercise, or the exercise when it is finished.
+
+    Attributes
+    ----------
+    made : folder and seed of each finished exercise.
+    sentences : what is hidden, one sentence for each effect.
+    files, records : the data files of the first exercise, and its first record of each kind.
+    """
+
+    out: Path
+    job: Job
+    made: Sequence[tuple[Path, int]]
+    bench: Mapping[str, str]
+    sentences: Sequence[str] = ()
+    files: Sequence[str] = ()
+    records: Sequence[Mapping[str, Any]] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolutionPage:
+    """The page of a solution; `there` says whether there is one."""
+
+    there: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectsPage:
+    """The catalogue of effects, each with its law as text and the address of its picture."""
+
+    entries: Sequence[Mapping[str, Any]]
 
 
 def show(ask: PageRequest) -> Response:
@@ -44,23 +111,17 @@ def _show_form(
     """
     sent = ask.sent
     pictures = [_write_picture_url(bench, one["hide"]) for one in found["effects"]]
-    return ask.page(
-        "exercises",
-        status=422 if wrong else 200,
-        title="Exercises",
-        presets=sorted(PRESETS),
-        catalogue=CATALOGUE,
+    page = ExercisesPage(
         bench=bench,
         found=found,
         shown=list(zip(found["effects"], pictures, strict=True)),
-        chosen=[one["key"] for one in found["effects"]],
-        slide=SLIDE,
-        out=sent.get("out", str(free_path(ask.user.workshop or ask.desk.root, "exercise"))),
-        folders=sent.get("folders", "1"),
-        seed=sent.get("seed", "0"),
+        out=str(sent.get("out", free_path(ask.user.workshop or ask.desk.root, "exercise"))),
+        folders=str(sent.get("folders", "1")),
+        seed=str(sent.get("seed", "0")),
         reported=bool(sent.get("reported")),
         wrong=wrong,
     )
+    return ask.page("exercises", status=422 if wrong else 200, title="Exercises", page=page)
 
 
 def draw(ask: PageRequest) -> Response:
@@ -110,21 +171,14 @@ def show_made(ask: PageRequest) -> Response:
         for folder, seed in zip(folders, arguments["seeds"], strict=False)
         if (folder / NAME).is_file()
     ]
-    what: dict[str, Any] = {"sentences": [], "files": [], "records": []}
+    what: Mapping[str, Any] = {}
     if job.over and made:
         bench, hide = arguments["bench"], arguments["hide"]
         what = ask.desk.workers.do(
             "describe_exercise", bench=bench, hide=hide, folder=str(made[0][0])
         )
-    return ask.page(
-        "made",
-        title=f"Exercise {out.name}",
-        out=out,
-        job=job,
-        made=made,
-        bench=arguments["bench"],
-        **what,
-    )
+    page = MadePage(out=out, job=job, made=made, bench=arguments["bench"], **what)
+    return ask.page("made", title=f"Exercise {out.name}", page=page)
 
 
 def stop(ask: PageRequest) -> Response:
@@ -137,11 +191,8 @@ def stop(ask: PageRequest) -> Response:
 def show_solution(ask: PageRequest) -> Response:
     """Show the solution of a folder, or the progress of making it."""
     folder = ask.folder()
-    return ask.page(
-        "solution",
-        title=f"Solution of {folder.name}",
-        there=file_problem(folder, "solution/solution.html") is None,
-    )
+    page = SolutionPage(there=file_problem(folder, "solution/solution.html") is None)
+    return ask.page("solution", title=f"Solution of {folder.name}", page=page)
 
 
 def show_catalogue(ask: PageRequest) -> Response:
@@ -155,7 +206,8 @@ def show_catalogue(ask: PageRequest) -> Response:
         }
         for effect, entry in zip(CATALOGUE, catalogue_data(CATALOGUE), strict=True)
     ]
-    return ask.page("effects", title="Effects beyond the linear chain", entries=entries)
+    page = EffectsPage(entries=entries)
+    return ask.page("effects", title="Effects beyond the linear chain", page=page)
 
 
 def _check_exercise(ask: PageRequest) -> tuple[dict[str, str], dict[str, Any]]:
