@@ -10,7 +10,7 @@ from pipeline.grading.gradebook.history import to_the_second
 from pipeline.grading.publish.feedback import numbers_table, sentence
 from pipeline.grading.words import points_text
 from pipeline.report.document import paragraph
-from pipeline.report.render.html import render_blocks
+from pipeline.report.html import render_blocks
 from pipeline.setup import Units
 from pipeline.words.text import rich
 
