@@ -18,7 +18,7 @@ from pipeline.desk.page_request import Message
 from pipeline.desk.served_files import scratch_folder
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.unpack import HAND_IN, is_debris, unpack
-from pipeline.grading.self_check.log import FILE as CHECKS
+from pipeline.grading.self_check.answers import FILE as CHECKS
 from pipeline.ingest.files import ENDINGS
 from pipeline.lock import lock_when_free
 from pipeline.output import own_folder, write_file

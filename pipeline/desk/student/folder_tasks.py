@@ -25,8 +25,15 @@ from pipeline.desk.student.form import (
 )
 from pipeline.desk.toml_form import Field
 from pipeline.errors import SubmissionError
-from pipeline.grading.self_check.log import CheckAnswer, find_basis, read_answers
-from pipeline.grading.self_check.words import asked_words, hint_words, number_words, result_words
+from pipeline.grading.self_check.answers import (
+    CheckAnswer,
+    asked_words,
+    find_basis,
+    hint_words,
+    number_words,
+    read_answers,
+    result_words,
+)
 from pipeline.identify.springs import find_springs
 from pipeline.ingest.fill import UNSURE, data_files, experiment_doubts, system_doubts
 from pipeline.lock import lock_when_free
