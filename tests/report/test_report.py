@@ -263,7 +263,7 @@ def test_the_same_analysis_gives_the_same_bytes(folders, tmp_path):
 
 @pytest.mark.parametrize(
     ("part", "files"),
-    [("render.write.render_pdf", Files()), ("plots.page.compare_runs", Files(plots=True))],
+    [("pdf.render_pdf", Files()), ("compare.compare_runs", Files(plots=True))],
 )
 def test_an_interrupted_report_leaves_the_earlier_one_whole(
     folders, tmp_path, monkeypatch, part, files
