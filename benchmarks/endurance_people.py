@@ -236,7 +236,7 @@ class Assistant(Person):
         if not lost:
             return
         criterion = self.draw.choice(sorted(set(lost)))
-        path = f"/grades/0/together?{urlencode({'criterion': criterion, 'lost': criterion})}"
+        path = f"/grades/0/bulk-change?{urlencode({'criterion': criterion, 'lost': criterion})}"
         text = self.get("several teams", path)
         rows = re.findall(r'name="team" value="([^"]+)".*?name="seen\.\1" value="([^"]*)"', text)
         if not rows:

@@ -335,7 +335,7 @@ def test_forms_that_make_no_sense_change_nothing(ta, grades):
     assert ta.post(ROOM + "grade", paths="", rubric="x").status == 422
     change(ta, "team-02", points="0.5", why="alone")
     for moment in ("", "2026-01-01", "%"):  # times at which no decision was made in this class
-        assert ta.post(ROOM + "together", do="undo", set=moment).status == 404
+        assert ta.post(ROOM + "bulk-change", do="undo", set=moment).status == 404
     assert overrides(grades, "team-02")["laws"].points == 0.5
     assert not overrides(grades)
 
@@ -676,7 +676,7 @@ def listed(answer: Answer) -> dict[str, list[str]]:
 def together(**more: str) -> str:
     """Return the address that lists teams flagged for Hz that lost points for "laws"."""
     about = {"criterion": "laws", "flag": "hz_for_rad_s", "lost": "laws"}
-    return f"{ROOM}together?{urlencode(about | more)}"
+    return f"{ROOM}bulk-change?{urlencode(about | more)}"
 
 
 def sent(answer: Answer, *teams: str, **fields: str) -> str:
@@ -736,11 +736,11 @@ def test_one_decision_for_several_teams_is_previewed(ta, grades):
 def test_the_result_is_shown_before_a_decision_also_without_scripts(ta):
     """A form that is sent by "get" has only its fields, not the query of its address."""
     page = ta.get(together(points="0.5"))
-    form = page.text.partition('class="together"')[2].partition("</form>")[0]
+    form = page.text.partition('class="bulk-change"')[2].partition("</form>")[0]
     hidden = re.findall(r'<input type="hidden" name="([^"]*)" value="([^"]*)">', form)
     fields = [(unescape(name), unescape(value)) for name, value in hidden]
     fields += [("points", "0.5"), *(("team", name) for name in listed(page))]
-    assert listed(ta.get(f"{ROOM}together?{urlencode(fields)}")) == listed(page)
+    assert listed(ta.get(f"{ROOM}bulk-change?{urlencode(fields)}")) == listed(page)
 
 
 def test_a_decision_applies_to_all_teams_or_none(ta, grades):
@@ -811,7 +811,7 @@ def test_one_decision_is_offered_for_the_same_slip(tmp_path):
     with at_desk(opened=tmp_path) as who:
         for name, same in (("a", ["a", "c"]), ("b", ["b", "d"])):
             page = who.get(at(name, criterion="state-model")).text
-            found = re.search(r'href="([^"]*together[^"]*)"[^>]*>Apply to the 2 teams', page)
+            found = re.search(r'href="([^"]*bulk-change[^"]*)"[^>]*>Apply to the 2 teams', page)
             assert found, name
             page = who.get(unescape(found[1]))
             assert sorted(listed(page)) == same
@@ -823,7 +823,7 @@ def test_undoing_a_decision_keeps_later_changes(ta, grades):
     names = list(listed(page))
     apply(ta, together(), sent(page, *names, do="apply", points="0.5", why="one unit"))
     change(ta, names[0], points="1", why="right after all")
-    ta.post(ROOM + "together", do="undo", set=ta.get(ROOM).value("set"))
+    ta.post(ROOM + "bulk-change", do="undo", set=ta.get(ROOM).value("set"))
     said = unescape(" ".join(re.findall(r'class="said">(.*?)<', ta.get(ROOM).text)))
     assert (str(len(names) - 1) in said, names[0] in said) == (True, True)
     given = {name: overrides(grades, name) for name in names}

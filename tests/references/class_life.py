@@ -125,7 +125,7 @@ def answered(people: dict[str, Visitor]) -> list[int]:
 def changed_together(people: dict[str, Visitor]) -> list[int]:
     """Give several teams the same points at once, and take one of two such changes back."""
     ada = people["Ada"]
-    address = ROOM + "together?" + urlencode({"flag": "hz_for_rad_s", "criterion": "laws"})
+    address = ROOM + "bulk-change?" + urlencode({"flag": "hz_for_rad_s", "criterion": "laws"})
     statuses = []
     for points, why in (("0.5", "one unit"), ("0.25", "one unit, twice")):
         page = ada.get(f"{address}&points={points}")

@@ -430,7 +430,7 @@ def test_a_change_updates_the_page_wherever_it_matters(show, tmp_path, scripts):
         else:
             row.get_by_role("button", name="Save").last.click()
         expect(stands).to_contain_text("33 recordings, all understood. The report is out of date.")
-        expect(window.locator(".way")).to_contain_text("Report out of date")
+        expect(window.locator(".step-list")).to_contain_text("Report out of date")
         if scripts:
             assert 0 < sum(one.request.sizes()["responseBodySize"] for one in answers) <= 10_000
             expect(row.get_by_label("Note")).to_be_visible()  # what was unfolded stays so

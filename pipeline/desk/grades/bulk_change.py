@@ -24,7 +24,7 @@ from pipeline.words.numbers import count
 from pipeline.words.text import capital, with_symbols
 
 _SAME = "same"  # value of the choice to leave points unchanged and only comment
-_DONE = "together"  # part of a page where the result is reported
+_DONE = "bulk_change"  # part of a page where the result is reported
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +108,7 @@ def _address(ask: PageRequest, *, done: str) -> str:
     """
     kept = {key: ask.query(key) for key in ("criterion", "of")} | {"done": done}
     wanted = Filter.read(ask.request.query_params).query
-    return f"{ask.here}together?{urlencode({k: v for k, v in kept.items() if v})}&{wanted}"
+    return f"{ask.here}bulk-change?{urlencode({k: v for k, v in kept.items() if v})}&{wanted}"
 
 
 def _find_criterion(ask: PageRequest, shown: ClassView) -> Criterion:
@@ -164,7 +164,7 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
     steps = list_steps(asked.points, shown.rubric)
     team = ask.query("of")
     return ask.page(
-        "together",
+        "bulk_change",
         status=status,
         title=_name_set(wanted),
         action=_address(ask, done=""),
@@ -211,7 +211,7 @@ def _widen(ask: PageRequest, shown: ClassView, wanted: Filter) -> tuple[str, int
     if many == len(wanted.chosen(shown)):
         return None
     about = {key: ask.query(key) for key in ("criterion", "of") if ask.query(key)}
-    return f"{ask.here}together?{urlencode(about)}&{wide.query}", many
+    return f"{ask.here}bulk-change?{urlencode(about)}&{wide.query}", many
 
 
 def _list_rows(

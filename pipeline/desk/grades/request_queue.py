@@ -73,7 +73,7 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
         for listed in (queue.waiting, queue.settled)
     )
     return ask.page(
-        "again",
+        "requests",
         status=status,
         title="Another look",
         of=of,

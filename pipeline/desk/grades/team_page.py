@@ -1,12 +1,14 @@
 """The page of a team: its points with the evidence, and the decisions of a person."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
+from markupsafe import Markup
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
@@ -27,9 +29,9 @@ from pipeline.desk.grades.criteria import (
     show_figures,
 )
 from pipeline.desk.grades.filters import Filter
-from pipeline.desk.grades.grading_form import start_grading
-from pipeline.desk.grades.recordings import find_recordings, list_papers, show_notes
+from pipeline.desk.grades.grading_form import last_run, start_grading
 from pipeline.desk.jobs import Busy
+from pipeline.desk.last_report import PLOTS, PLOTS_OF
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
@@ -38,6 +40,7 @@ from pipeline.grading.gradebook.class_lines import ClassRow, slip_of
 from pipeline.grading.gradebook.decisions import Conflict, read_points
 from pipeline.grading.gradebook.entry import TOTAL, Entry
 from pipeline.grading.gradebook.history import event_words, to_the_second
+from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.repairs import (
     Repair,
     read_original,
@@ -50,11 +53,16 @@ from pipeline.grading.publish.class_page import feedback_link
 from pipeline.grading.publish.view import renamed_events, view
 from pipeline.grading.rubric import Rubric, find_remarks
 from pipeline.grading.words import WORDS, person_lines, points_text
+from pipeline.output import LOCK
 from pipeline.report.html import render_drawing
+from pipeline.submission.load import NAME, file_problem
 from pipeline.words.text import capital
 
 _POINTS = "points"  # part of the page where points are changed
 _TOTAL = "total"  # part of the page where the total is changed
+# Files that making the plots adds to a folder.
+_ADDED = (PLOTS, PLOTS_OF, f"{Path(PLOTS).parent.name}/{LOCK}")
+_MOST_PAPERS = 20  # PDF files listed
 
 
 def show(ask: PageRequest) -> Response:
@@ -173,9 +181,9 @@ def send_paper(ask: PageRequest) -> Response:
     """Send a PDF that a team submitted."""
     shown = read_class(ask)
     team = find_team(shown, ask.query("of"))
-    folder = find_recordings(ask, shown, open_gradebook(ask).entry(team.submission))
+    folder = _find_recordings(ask, shown, open_gradebook(ask).entry(team.submission))
     name = ask.query("file")
-    if folder is None or name not in list_papers(folder):
+    if folder is None or name not in _list_papers(folder):
         raise HTTPException(404, "there is no such file")
     return served_files.send_paper(folder, name)
 
@@ -195,7 +203,7 @@ def _show_page(
     before, after = wanted.beside(shown, name)
     items = list_items(grade, now)
     chosen = _find_chosen(ask, items, now.rubric)
-    folder = find_recordings(ask, shown, now)
+    folder = _find_recordings(ask, shown, now)
     return ask.page(
         "team",
         status=status,
@@ -219,10 +227,10 @@ def _show_page(
         repair=_show_repair(ask, shown, team, wrong=wrong_repair),
         requests={criterion: request.state for criterion, request in now.requests.items()},
         recordings=folder,
-        notes=show_notes(ask, folder) if folder else "",
+        notes=_show_notes(ask, folder) if folder else "",
         papers=[
             (paper, f"{ask.here}paper?{urlencode({'of': name, 'file': paper})}")
-            for paper in (list_papers(folder) if folder else ())
+            for paper in (_list_papers(folder) if folder else ())
         ],
         requests_at=f"{ask.here}requests?{urlencode({'of': name})}",
         **_show_chosen(ask, shown, grade, now, chosen=chosen, wrong=wrong),
@@ -291,7 +299,7 @@ def _show_chosen(
             describe_flag(flag, grade.units) | {"others": _link_others(ask, shown, flag)}
             for flag in flags
         ],
-        "together": _link_together(ask, shown, grade, one, flags) if one else [],
+        "bulk_changes": _link_bulk_changes(ask, shown, grade, one, flags) if one else [],
         "figures": _link_figures(ask, name, figures, chosen),
         "others": _link_figures(ask, name, show_figures(drawn, None, None), chosen),
         "reasons": reasons,
@@ -318,7 +326,7 @@ def _link_others(ask: PageRequest, shown: ClassView, flag: Flag) -> list[tuple[s
     return [(name, write_address(ask, name) if name in shown.teams else "") for name in names]
 
 
-def _link_together(
+def _link_bulk_changes(
     ask: PageRequest, shown: ClassView, grade: Grade, one: dict[str, Any], flags: Sequence[Flag]
 ) -> list[tuple[str, str]]:
     """Return links, with their text, to apply the same points to all teams with the same flag."""
@@ -334,7 +342,7 @@ def _link_together(
             if one["by_hand"]:  # the decision for this team is offered for all
                 points = "same" if one["is_comment"] else one["points"]
                 about |= {"points": points, "why": one["own_reason"]}
-            address = f"{ask.here}together?{urlencode(about)}&{wanted.query}"
+            address = f"{ask.here}bulk-change?{urlencode(about)}&{wanted.query}"
             found.append((address, f"Apply to the {many} teams with {title}"))
     return found
 
@@ -400,3 +408,48 @@ def write_address(ask: PageRequest, name: str, **more: str) -> str:
     """Return the URL of a team's page; it keeps the filter, so that next and previous work."""
     wanted = Filter.read(ask.request.query_params).query
     return f"{ask.here}team?{urlencode({'of': name, **more})}" + (f"&{wanted}" if wanted else "")
+
+
+# ------------------------------------------------------- the folder that was graded
+
+
+def _show_notes(ask: PageRequest, folder: Path) -> Markup:
+    """Return a team's notes as HTML. A worker makes it, because the desk parses no such file."""
+    return Markup(ask.desk.workers.do("render_notes", folder=str(folder)))
+
+
+def _list_papers(folder: Path) -> list[str]:
+    """Return the PDF files in a submission's folder, by their paths in it."""
+    files = (file for file in folder.rglob("*") if file.suffix.lower() == ".pdf")
+    names = sorted(file.relative_to(folder).as_posix() for file in files)
+    return list(islice((n for n in names if file_problem(folder, n) is None), _MOST_PAPERS))
+
+
+def _find_recordings(ask: PageRequest, shown: ClassView, entry: Entry) -> Path | None:
+    """Return the folder that was graded; None if it is not found or not allowed.
+
+    A gradebook stores no folder, so the folder is looked for on this computer. Its
+    files must be those that were graded, because a later version would show other
+    recordings. Plots that were added since do not matter.
+    """
+    if not ask.user.owns or shown.names is not None:
+        return None
+    graded = entry.key.rpartition("-")[2]
+    for folder in dict.fromkeys(_list_candidates(ask, entry.submission)):
+        if (folder / NAME).is_file():
+            now = (digest([folder], without=added) for added in ((), _ADDED))
+            if graded in now:
+                return folder
+    return None
+
+
+def _list_candidates(ask: PageRequest, name: str) -> Iterator[Path]:
+    """Yield folders that may be the submission: open ones, graded ones, or near the gradebook."""
+    place = ask.place_or_404()
+    yield from (folder for folder in ask.user.folders if folder.name == name)
+    run = last_run(ask.user, place)
+    for path in run.paths if run else ():
+        yield from (Path(path), Path(path) / name)
+    if isinstance(place, Path):
+        yield place.parent / name
+        yield from (beside / name for beside in sorted(place.parent.iterdir()))
