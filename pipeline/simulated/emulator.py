@@ -452,9 +452,9 @@ class Server:
         if data:
             self._core.receive(data)
             for command in self._tap.feed(data):
-                self._overhear(command)
+                self._note_command(command)
 
-    def _overhear(self, command: protocol.Command) -> None:
+    def _note_command(self, command: protocol.Command) -> None:
         """Note a command to the controller that concerns the hands or the log."""
         match command:
             case protocol.Start():

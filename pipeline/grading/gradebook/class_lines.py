@@ -38,7 +38,7 @@ class Judged(TypedDict):
     points: float
 
 
-class Slip(TypedDict, total=False):
+class MistakeEvidence(TypedDict, total=False):
     """What the evidence of a flag says about the kind of mistake."""
 
     slip: str | None
@@ -49,7 +49,7 @@ class Flagged(TypedDict):
     """A mistake that the grader names."""
 
     code: Code
-    evidence: Slip
+    evidence: MistakeEvidence
 
 
 def slip_of(evidence: Mapping[str, Any]) -> str:

@@ -258,7 +258,7 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
     with single digits are ignored, because rounding makes them agree.
     """
     both = [name for name in reported.final if name in reported.initial]
-    same = [n for n in both if _same(reported, n)]
+    same = [n for n in both if reported.final[n] == reported.initial[n]]
     most = 0.75  # least share of equal numbers
     if not both or len(same) < most * len(both):
         return []
@@ -301,7 +301,3 @@ def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> floa
     # A difference of two normal errors has the density 1/√(4π) at zero.
     again = 1.0 if is_vague(typed) else min(1.0, 2 * float(half) / (apart * 3.5))
     return again * exp(-surprise)
-
-
-def _same(reported: Reported, name: str) -> bool:
-    return reported.final[name] == reported.initial[name]
