@@ -25,6 +25,7 @@ _LEFT_OUT = frozenset({
 _WITH_PATHS = "run.json"  # what a grading was called with
 _NAMES = ("id", "code", "name", "key", "experiment", "run", "cart", "effect", "number")
 _LONGEST = 6  # words of a name; a longer text is a sentence
+_ROUNDING = 1e-12  # a smaller number is the rounding error of a computer
 _ALIGNED = re.compile(r"[-−+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?", re.IGNORECASE)
 
 
@@ -107,10 +108,14 @@ class _Cells(HTMLParser):
 
 
 def numbers_shown(page: str) -> list[str]:
-    """Return all numbers in the tables and formulas of a page, as written, in order of size."""
+    """Return all numbers in the tables and formulas of a page, as written, in order of size.
+
+    Numbers inside sentences are left out, like sentences.
+    """
     cells = _Cells()
     cells.feed(page)
-    shown = [one for text in cells.texts for one in _ALIGNED.findall(text.replace("−", "-"))]
+    texts = [text for text in cells.texts if not text.rstrip().endswith(".")]
+    shown = [one for text in texts for one in _ALIGNED.findall(text.replace("−", "-"))]
     return sorted((one for one in shown if "." in one), key=lambda one: (float(one), one))
 
 
@@ -118,12 +123,14 @@ def numbers_shown(page: str) -> list[str]:
 
 
 def rounded(facts: Any, *, digits: int) -> Any:
-    """Return the facts with numbers of fewer digits."""
+    """Return the facts with numbers of fewer digits; 0 for the rounding errors of a computer."""
     if isinstance(facts, Mapping):
         return {name: rounded(one, digits=digits) for name, one in facts.items()}
     if isinstance(facts, list):
         return [rounded(one, digits=digits) for one in facts]
-    return float(f"{facts:.{digits}g}") if isinstance(facts, float) else facts
+    if not isinstance(facts, float):
+        return facts
+    return float(f"{facts:.{digits}g}") if abs(facts) > _ROUNDING else 0.0
 
 
 def flat(facts: Any, path: str = "") -> Iterator[tuple[str, Any]]:
