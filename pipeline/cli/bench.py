@@ -1,7 +1,9 @@
 """Commands of a bench: plan, acquire, explore, emulate."""
 
 import json
+import signal
 import sys
+import threading
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,15 +12,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipeline.cli import INTERRUPTED
-from pipeline.cli.common import AsJson, Folder, app, progress_line, say
+from pipeline.cli.common import (
+    AsJson,
+    Folder,
+    Hide,
+    Model,
+    Preset,
+    app,
+    progress_line,
+    say,
+)
 from pipeline.errors import ConfigError
 
 if TYPE_CHECKING:
     from pipeline.bench.terminal import Terminal
-import signal
-import threading
-
-from pipeline.cli.common import Hide, Model, Preset
 
 
 @app.command()

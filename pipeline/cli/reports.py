@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.common import AsJson, Folder, app, progress_line, say
+from pipeline.cli.common import (
+    AsJson,
+    Folder,
+    Hide,
+    Model,
+    Preset,
+    app,
+    progress_line,
+    say,
+)
 from pipeline.errors import PipelineError
 from pipeline.second_process import SecondProcess
 from pipeline.words.progress import Progress
@@ -23,7 +32,6 @@ if TYPE_CHECKING:
     from pipeline.report.make_report import Files
     from pipeline.results import Analysis
     from pipeline.submission import Submission
-from pipeline.cli.common import Hide, Model, Preset
 
 
 @app.command()

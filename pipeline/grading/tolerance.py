@@ -6,22 +6,17 @@ with the same result as grading again.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from functools import lru_cache
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
-from pipeline.grading.grade import Criterion, Grade
-from pipeline.grading.rubric import Late, Rubric
+from pipeline.grading import rubric as asked
 
 if TYPE_CHECKING:
     from pipeline.grading.reference import Reference
-from collections.abc import Mapping
-from typing import Literal
-
-from pipeline.grading import rubric as asked
 
 Number = TypeVar("Number", float, Fraction)
 
@@ -141,41 +136,6 @@ def credit(error: Fraction, *, full: float, none: float) -> Fraction:
     if error >= bottom:
         return Fraction(0)
     return (bottom - error) / (bottom - top)
-
-
-def to_step(points: Fraction, step: float) -> Fraction:
-    """Round points to the rubric's step, halves up, with exact arithmetic."""
-    return math.floor(points / exact(step) + Fraction(1, 2)) * exact(step)
-
-
-def with_total(grade: Grade, criteria: Sequence[Criterion], *, rubric: Rubric) -> Grade:
-    """Return the grade with these criteria, and the total that follows from them.
-
-    Lateness is deducted from the points earned. Then the adjustments of the grade are added; the
-    total never falls below 0.
-    """
-    earned = sum((exact(criterion.points) for criterion in criteria), Fraction(0))
-    deducted = late_deduction(earned, late=rubric.late, step=rubric.step, days_late=grade.days_late)
-    adjusted = sum((exact(one.points) for one in grade.adjustments), Fraction(0))
-    by_person = {asked.id for asked in rubric.criteria if asked.check == "manual"}
-    changed = {
-        "criteria": tuple(criteria),
-        "points": float(max(earned - deducted + adjusted, Fraction(0))),
-        "out_of": rubric.out_of,
-        "deducted": float(deducted),
-        "open": tuple(c.id for c in criteria if c.id in by_person and c.outcome == "skip"),
-    }
-    return grade.model_copy(update=changed)
-
-
-def late_deduction(earned: Fraction, *, late: Late, step: float, days_late: float) -> Fraction:
-    """Return the deduction from the points earned, for every day begun after the grace period.
-
-    It is rounded to the rubric's step; a half is rounded down, in the student's favour.
-    """
-    days = max(0, math.ceil(days_late - late.grace_days))
-    share = min(exact(late.percent_per_day) * days, exact(late.most_percent)) / 100
-    return -to_step(-earned * share, step)
 
 
 ALL, NONE = Fraction(1), Fraction(0)  # shares of the points

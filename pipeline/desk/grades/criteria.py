@@ -12,7 +12,8 @@ from pipeline.grading.publish.feedback import TONES, alternative, evidence_table
 from pipeline.grading.publish.feedback_figures import is_response, numbers_in
 from pipeline.grading.rubric import Criterion as Asked
 from pipeline.grading.rubric import Rubric, is_about
-from pipeline.grading.tolerance import exact, to_step
+from pipeline.grading.tolerance import exact
+from pipeline.grading.total import to_step
 from pipeline.grading.words import WORDS, points_text
 from pipeline.names import read_name
 from pipeline.report.html import render_blocks

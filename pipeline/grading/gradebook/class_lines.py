@@ -18,6 +18,7 @@ from pipeline.grading.grade import (
     GradeTable,
     Outcome,
 )
+from pipeline.grading.gradebook.entry import whole_version
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import WORDS
 
@@ -148,7 +149,7 @@ class ClassRow:
     @property
     def version(self) -> str:
         """Version of all that is known of the submission, as in `Entry.whole_version`."""
-        return f"{self.grading}.{max(self.made_of[2:], default=0)}.{int(self.shared is not None)}"
+        return whole_version(self.grading, self.made_of[2:], is_shared=self.shared is not None)
 
 
 @dataclass(frozen=True, kw_only=True)

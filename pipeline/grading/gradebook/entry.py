@@ -12,7 +12,7 @@ from typing import Literal
 from pipeline.grading.grade import Adjustment, Criterion, Grade, GradeOverride
 from pipeline.grading.gradings import same_people
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.tolerance import with_total
+from pipeline.grading.total import with_total
 
 # The place of an adjustment in the gradebook. No criterion can have this id. All adjustments count;
 # of the points for a criterion only the newest do.
@@ -106,6 +106,18 @@ def reviewer(events: Iterable[Event], grading: int) -> str:
     """Return the name of the person who marked a grading as reviewed, or ""."""
     marks = [event for event in events if event.grading == grading]
     return marks[-1].by if marks and marks[-1].what == "reviewed" else ""
+
+
+def whole_version(grading: int, events: Iterable[int], *, is_shared: bool) -> str:
+    """Return the version of all that is known of a submission.
+
+    It changes with every event, and when recordings are found to be shared.
+
+    Parameters
+    ----------
+    events : numbers of the events about the submission.
+    """
+    return f"{grading}.{max(events, default=0)}.{int(is_shared)}"
 
 
 def hide_people(text: str, people: Iterable[str]) -> str:
@@ -268,13 +280,9 @@ class Entry:
 
     @property
     def whole_version(self) -> str:
-        """Version of all that is known of the submission.
-
-        It changes with every event, and when recordings are found to be shared.
-        """
-        newest = max((event.id for event in self.events), default=0)
+        """Version of all that is known of the submission; see the function of this name."""
         is_shared = any(flag.code == "shared_data" for flag in self.graded.flags)
-        return f"{self.grading}.{newest}.{int(is_shared)}"
+        return whole_version(self.grading, [one.id for one in self.events], is_shared=is_shared)
 
     def request_version(self, criterion: str) -> str:
         """Return the version of a request, which an answer must name."""

@@ -21,7 +21,8 @@ from pipeline.grading.grade import CODES, Code, Criterion, Flag, Grade, Outcome
 from pipeline.grading.judge.context import Judgement, Verdict
 from pipeline.grading.mistakes.undo import Slip
 from pipeline.grading.rubric import Rubric, concerns
-from pipeline.grading.tolerance import ALL, NONE, Deviation, exact, points_for, to_step, with_total
+from pipeline.grading.tolerance import ALL, NONE, Deviation, exact, points_for
+from pipeline.grading.total import to_step, with_total
 from pipeline.grading.words import WORDS
 from pipeline.words.numbers import first_few
 

@@ -33,7 +33,8 @@ from pipeline.grading.reference import (
     trusted_chain,
 )
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.tolerance import rounding, with_total
+from pipeline.grading.tolerance import rounding
+from pipeline.grading.total import with_total
 from pipeline.identify.recording_checks import find_bad_recordings, is_reversed
 from pipeline.ingest.columns import conversion, is_count
 from pipeline.names import read_name

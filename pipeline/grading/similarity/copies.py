@@ -85,7 +85,7 @@ class SharedRecord:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Entry:
+class _Owned:
     """A fingerprint, and the number of the submission that contains it."""
 
     owner: int
@@ -150,15 +150,15 @@ def find_copies(
     }
 
 
-def _by_group(owners: Iterable[Member]) -> dict[str, list[_Entry]]:
+def _by_group(owners: Iterable[Member]) -> dict[str, list[_Owned]]:
     """Group fingerprints that may come from the same recording, without duplicates of one owner."""
-    groups: dict[str, list[_Entry]] = defaultdict(list)
+    groups: dict[str, list[_Owned]] = defaultdict(list)
     for owner, prints in enumerate(owners):
         once: dict[tuple[str, bytes], Fingerprint] = {}
         for one in unpack(prints.fingerprints):  # a recording under several names counts once
             once.setdefault((one.group, one.residual.tobytes()), one)
         for one in once.values():
-            groups[one.group].append(_Entry(owner=owner, print=one))
+            groups[one.group].append(_Owned(owner=owner, print=one))
     return groups
 
 
@@ -219,7 +219,7 @@ class _Pairs:
 
     def __init__(
         self,
-        groups: Mapping[str, Sequence[_Entry]],
+        groups: Mapping[str, Sequence[_Owned]],
         *,
         everyone: Sequence[Member],
         first_batch: int,
@@ -337,7 +337,7 @@ class _Pairs:
 
 
 def _equal(
-    entries: Sequence[_Entry],
+    entries: Sequence[_Owned],
     *,
     first_batch: int,
     everyone: int,
@@ -390,7 +390,7 @@ def _equal(
 
 
 def _candidates(
-    entries: Sequence[_Entry], *, everyone: int
+    entries: Sequence[_Owned], *, everyone: int
 ) -> Iterator[tuple[int, int, int, int, float]]:
     """Yield anchors with similar noise: (entry, anchor, other entry, other anchor, sigmas).
 
@@ -424,7 +424,7 @@ def _candidates(
             yield *places[place], *first[column], sigmas
 
 
-def _windows(entries: Sequence[_Entry], places: Sequence[tuple[int, int]]) -> np.ndarray:
+def _windows(entries: Sequence[_Owned], places: Sequence[tuple[int, int]]) -> np.ndarray:
     """Return the residuals around anchors, (n, n_free * _WIDTH).
 
     They are scaled so that the product of two is approximately in sigmas.

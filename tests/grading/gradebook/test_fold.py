@@ -15,7 +15,7 @@ from pipeline.grading.gradebook import decisions
 from pipeline.grading.gradebook.decisions import WantedPoints
 from pipeline.grading.gradebook.entry import POINTS, TOTAL, Entry, Event
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.tolerance import with_total
+from pipeline.grading.total import with_total
 from tests.helpers.grades import book_of, make_grade, two_cart_rubric
 
 RUBRIC = two_cart_rubric()

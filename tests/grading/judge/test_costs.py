@@ -14,7 +14,8 @@ from pipeline.grading.mistakes.state_model import (
     order_names,
 )
 from pipeline.grading.rubric import Late
-from pipeline.grading.tolerance import exact, late_deduction, to_step
+from pipeline.grading.tolerance import exact
+from pipeline.grading.total import late_deduction, to_step
 from pipeline.plant.chain import PRESETS
 from pipeline.submission import ReportedStateSpace
 from tests.helpers.grading_students import Student, criterion, student, typed
