@@ -315,7 +315,10 @@ def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
     say(f"erased: {', '.join(gone)}")
     if folder.is_dir() and (files := remove_exports(folder)):
         say(f"deleted {count(len(files), 'exported file')} that also contained them; export again")
-    say("not erased: the submitted folders, backups, and files that you copied elsewhere")
+    say(
+        "not erased: the submitted folders, zip files in handed-in/, backups, and files that you "
+        "copied elsewhere"
+    )
 
 
 @contextmanager

@@ -187,7 +187,7 @@ def run_report(
         from pipeline.report.make_report import make_report
 
         # Note the state before the files are read, so that the desk notices a later change.
-        made_of = stat_sources(folder)
+        made_of = stat_sources(folder if folder.is_dir() else folder.parent)
         submission = _load(folder)
         is_for_desk = out is None and files.pdf
         out = named_folder(out) if out else own_folder(submission.folder, "report")

@@ -275,6 +275,8 @@ def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], A
         user, room = request.scope["user"], path.split("/")[1]
         if not user.may(room):
             raise HTTPException(403, f"this page is not for the role {user.role}")
+        if path.endswith("/grade") and not user.owns:
+            raise HTTPException(403, "only the owner of this computer can enter folders")
         form = FormData()
         if request.method == "POST":
             form = await request.form(max_files=HAND_IN.members, max_fields=5_000)

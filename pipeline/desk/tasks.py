@@ -222,6 +222,8 @@ def check_grading(
 ) -> dict[str, str]:
     """Return why a grading cannot start, by field of its form.
 
+    Zip files that cannot be graded are no reason, unless there is nothing else.
+
     Parameters
     ----------
     files : uploaded archives.
@@ -231,10 +233,16 @@ def check_grading(
     from pipeline.grading.rubric_file import load_rubric
 
     wrong: dict[str, str] = {}
+    broken: dict[str, str] = {}
+    n_good = 0
     for name, given in (("files", files), ("paths", paths)):
         with keep_refusal(name, wrong):
             for path in given:
-                check_hand_ins(Path(path), skip=[Path(skip)] if skip else [])
+                if why := check_hand_ins(Path(path), skip=[Path(skip)] if skip else []):
+                    broken.setdefault(name, why)
+                else:
+                    n_good += 1
+    wrong |= {} if n_good else broken | wrong
     with keep_refusal("rubric", wrong):
         if not rubric:
             raise ConfigError("choose a rubric, or enter a file")

@@ -194,7 +194,7 @@ def test_a_class_is_graded_from_a_zip(root, tmp_path, anonymous):
     assert kept.read_bytes() == raw
     run = read_run(out)
     assert run is not None
-    assert (run.paths, run.rubric.endswith(f"{RUBRIC}.toml")) == ((str(kept),), True)
+    assert (run.paths, run.rubric) == ((str(kept),), RUBRIC)
     assert run.options["anonymous"] is anonymous
     with Gradebook(out) as book:
         late = {entry.submission: entry.grade.days_late for entry in book.entries()}
@@ -211,8 +211,9 @@ def test_a_class_is_graded_from_a_zip(root, tmp_path, anonymous):
 def test_a_grading_that_was_stopped_is_continued(root, tmp_path):
     """A grading that was stopped, or whose desk ended, is started again with what was typed."""
     teams = tmp_path / "class"
-    for n in range(3):
-        write_team(teams / f"team-{n}", n)
+    names = {f"team-{n}" for n in range(6)}  # enough for a Stop before the last
+    for n, name in enumerate(names):
+        write_team(teams / name, n)
     out = tmp_path / "grades"
     with at_desk() as who:
         assert send(who, NEW, paths=str(teams), rubric=RUBRIC, out="grades").status == 303
@@ -230,7 +231,66 @@ def test_a_grading_that_was_stopped_is_continued(root, tmp_path):
         assert send(who, "/grades/0/grade", paths="", rubric=RUBRIC).status == 303
         assert 'id="teams"' in finish(who, "/grades/0/").text
     with Gradebook(out) as book:
-        assert {entry.submission for entry in book.entries()} == {"team-0", "team-1", "team-2"}
+        assert {entry.submission for entry in book.entries()} == names
+
+
+def unfinished(out: Path, *paths: Path, **options: bool) -> Path:
+    """Write the folder of a grading that did not end."""
+    out.mkdir()
+    Gradebook(out, create=True).close()
+    save_run(out, Run(paths=tuple(map(str, paths)), rubric=RUBRIC, options=options))
+    return out
+
+
+@pytest.mark.usefixtures("all_work_here")
+def test_a_refused_form_hides_names_as_before(root):
+    """An unfinished anonymous class stays anonymous after a mistake, and shows no paths."""
+    out = unfinished(root / "grades", root / "jane-doe.zip", anonymous=True)
+    with at_desk(out) as who:
+        page = who.get("/grades/0/")
+        assert "jane-doe" not in page.text
+        assert 'name="anonymous" value="1" checked' in page.text
+        refused = send(who, "/grades/0/grade", rubric=RUBRIC, anonymous="1")
+        assert (refused.status, refused.wrong_fields) == (422, {"paths"})
+        assert "jane-doe" not in refused.text
+        assert 'name="anonymous" value="1" checked' in refused.text
+
+
+@pytest.mark.usefixtures("all_work_here")
+def test_an_upload_never_replaces_another_one(root, tmp_path):
+    """A zip with the name of an earlier upload is refused, unless it is the same."""
+    first, second = (packed(write_team(tmp_path / name / "lab", n)) for n, name in enumerate("ab"))
+    out = unfinished(root / "grades")
+    (out / "handed-in").mkdir()
+    (out / "handed-in" / "lab.zip").write_bytes(first)
+    with at_desk(out) as who:
+        for address in (NEW, "/grades/0/grade"):
+            refused = send(who, address, ("lab.zip", second), rubric=RUBRIC, out=str(out))
+            assert (refused.status, refused.wrong_fields) == (422, {"files"})
+        same = send(who, NEW, ("lab.zip", first), rubric="x", out=str(out))
+        assert "another file" not in same.text
+        assert "rubric" in same.wrong_fields
+    assert (out / "handed-in" / "lab.zip").read_bytes() == first
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_one_damaged_zip_does_not_stop_the_others(root, tmp_path):
+    """A damaged zip is a submission with a reason; a second request meanwhile changes nothing."""
+    good = packed(write_team(tmp_path / "team-1", 1))
+    many = [(f"team-{n}.zip", good) for n in range(20)]  # enough for a request meanwhile
+    with at_desk() as who:
+        files = [*many, ("damaged.zip", good[:-40])]
+        assert send(who, NEW, *files, rubric=RUBRIC, out="grades").status == 303
+        again = send(who, NEW, ("other.zip", good), rubric=RUBRIC, out="grades")
+        assert (again.status, again.headers["location"]) == (303, "/grades/0/")
+        finish(who, "/grades/0/")
+    out = root / "grades"
+    kept = {path.name for path in (out / "handed-in").iterdir()}
+    assert kept == {name for name, _ in files}
+    with Gradebook(out) as book:
+        states = {entry.submission: entry.graded.status for entry in book.entries()}
+    assert states == {Path(name).stem: "graded" for name, _ in many} | {"damaged": "failed"}
 
 
 @pytest.mark.usefixtures("all_work_here")

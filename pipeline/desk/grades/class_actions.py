@@ -96,11 +96,11 @@ def export_class(ask: PageRequest) -> Response:
 
 def grade(ask: PageRequest) -> Response:
     """Grade the class again, or for the first time if an earlier attempt did not end."""
-    if not open_gradebook(ask).is_graded:
-        anonymous, refuse = bool(ask.text("anonymous")), partial(show_unfinished, ask)
-    else:
+    if open_gradebook(ask).is_graded:
         anonymous, refuse = read_class(ask).rubric.anonymous, partial(show_class, ask)
-    return grade_again(ask, anonymous=anonymous, refuse=refuse)
+        return grade_again(ask, is_first=False, anonymous=anonymous, refuse=refuse)
+    anonymous, refuse = bool(ask.text("anonymous")), partial(show_unfinished, ask)
+    return grade_again(ask, is_first=True, anonymous=anonymous, refuse=refuse)
 
 
 def _store_upload(ask: PageRequest, name: str, path: Path) -> Path | None:

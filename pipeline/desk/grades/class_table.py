@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
@@ -82,7 +83,7 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
     ----------
     form : the refused form to grade the class again.
     """
-    if not open_gradebook(ask).is_graded:
+    if isinstance(ask.place_or_404(), Path) and not open_gradebook(ask).is_graded:
         return show_unfinished(ask)
     shown, wanted = read_class(ask), Filter.read(ask.request.query_params)
     chosen = wanted.chosen(shown)

@@ -4,10 +4,10 @@ import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from filecmp import cmp
 from pathlib import Path, PurePosixPath
 
 from starlette.datastructures import UploadFile
-from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk.browse import free_path
@@ -90,7 +90,9 @@ def show_new(ask: PageRequest) -> Response:
 
 def show_unfinished(ask: PageRequest, form: GradingForm | None = None) -> Response:
     """Show the progress of the first grading of a class, or the form to start it again."""
-    return _show(ask, form or fill_form(ask, named=True, is_first=True))
+    run = last_run(ask.user, ask.place_or_404())
+    named = not (run and run.options.get("anonymous"))
+    return _show(ask, form or fill_form(ask, named=named, is_first=True))
 
 
 def grade_new(ask: PageRequest) -> Response:
@@ -99,43 +101,58 @@ def grade_new(ask: PageRequest) -> Response:
     with scratch_folder() as scratch:
         run = _read_run(ask, ask.text("paths").splitlines(), scratch=scratch, wrong=wrong)
         out = _read_new_class(ask, run, wrong=wrong)
+        wrong |= _check_kept(run, scratch, out) if out else {}
         if out is None or wrong:
             return _show(ask, _typed(ask, wrong=wrong, is_first=True))
+        if (job := ask.desk.jobs.of(out)) and not job.over:
+            return ask.back(enter(ask.user, out), "This class is being graded already.")
         out.mkdir(OWNERS_FOLDER, exist_ok=True)
         Gradebook(out, create=True).close()  # so that the folder is known as that of a class
         run = _keep_uploads(run, scratch, out)
     address = enter(ask.user, out)
     start_grading(ask, run, out)
+    save_run(out, run)  # so that a grading that does not end can be continued
     return ask.back(address)
 
 
 def grade_again(
-    ask: PageRequest, *, anonymous: bool, refuse: Callable[[GradingForm], Response]
+    ask: PageRequest,
+    *,
+    is_first: bool,
+    anonymous: bool,
+    refuse: Callable[[GradingForm], Response],
 ) -> Response:
     """Start a further grading of a class; unchanged submissions keep their results.
 
     Parameters
     ----------
+    is_first : whether no earlier grading ended.
     refuse : function that shows the page of the class with a refused form.
     """
-    if not ask.user.owns:
-        raise HTTPException(403, "only the owner of this computer can enter folders")
     folder, wrong = ask.folder(), dict[str, str]()
     before = read_run(folder) or Run(paths=(), rubric="")
     with scratch_folder() as scratch:
         paths = ask.text("paths").splitlines() or ([] if _uploads(ask) else before.paths)
         run = _read_run(ask, paths, scratch=scratch, wrong=wrong, skip=folder)
+        wrong |= _check_kept(run, scratch, folder)
         if wrong:
-            return refuse(_typed(ask, wrong=wrong, is_first=False))
+            hidden = (anonymous or before.options.get("anonymous")) and not ask.text("paths")
+            if hidden and "paths" in wrong:  # the reason may contain names
+                wrong["paths"] = "cannot be graded; run cartlab grade in a terminal to see why"
+            form = _typed(ask, wrong=wrong, is_first=is_first)
+            return refuse(replace(form, known=len(before.paths) if hidden else 0))
         if (job := ask.job) and not job.over and _uploads(ask):
             raise Busy(f"{job.title} is running in this folder: wait until it ends")
         run = _keep_uploads(run, scratch, folder)
-    start_grading(ask, replace(run, options={**before.options, "anonymous": anonymous}), folder)
+    run = replace(run, options={**before.options, "anonymous": anonymous})
+    start_grading(ask, run, folder)
+    if is_first:
+        save_run(folder, run)
     return ask.back(f"{ask.here}#work")
 
 
 def start_grading(ask: PageRequest, run: Run, folder: Path) -> None:
-    """Start a grading, and keep what is graded, so that it can be started again.
+    """Start a grading. When it ends, it saves what was graded.
 
     Raises
     ------
@@ -143,7 +160,6 @@ def start_grading(ask: PageRequest, run: Run, folder: Path) -> None:
     """
     arguments = {"folder": str(folder), **asdict(run)}
     ask.desk.jobs.start("grade_submissions", title="Grading", place=folder, **arguments)
-    save_run(folder, run)
 
 
 def _show(ask: PageRequest, form: GradingForm) -> Response:
@@ -246,13 +262,26 @@ def _store_uploads(ask: PageRequest, scratch: Path, *, wrong: dict[str, str]) ->
     for sent in _uploads(ask):
         name = PurePosixPath((sent.filename or "").replace("\\", "/"))
         path = scratch / f"{fit_name(name.stem)}.zip"
-        if name.suffix.lower() != ".zip" or str(path) in stored:
+        if name.suffix.lower() != ".zip":
+            wrong["files"] = f"{quote(name.name)}: choose zip files only"
+            continue
+        if str(path) in stored:
             wrong["files"] = f"{quote(name.name)}: choose zip files with different names"
             continue
         with path.open("xb") as file:
             shutil.copyfileobj(sent.file, file)  # the limit on requests keeps it small
         stored[str(path)] = None
     return list(stored)
+
+
+def _check_kept(run: Run, scratch: Path, folder: Path) -> dict[str, str]:
+    """Return a refusal if an uploaded file would replace another one of its name in the class."""
+    for path in map(Path, run.paths):
+        kept = folder / _UPLOADS / path.name
+        if path.parent == scratch and kept.exists() and not cmp(path, kept, shallow=False):
+            why = f"{quote(path.name)}: another file of this name was uploaded before; rename it"
+            return {"files": why}
+    return {}
 
 
 def _keep_uploads(run: Run, scratch: Path, folder: Path) -> Run:

@@ -25,7 +25,7 @@ from pipeline.grading.rubric_file import find_rubric, load_rubric
 from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.lock import lock_or_refuse
 from pipeline.output import OWNERS_FOLDER, named_folder, own_folder
-from pipeline.resources import EXAMPLES
+from pipeline.resources import EXAMPLES, RUBRICS
 from pipeline.results import Record
 from pipeline.submission import Reported, Submission, load_submission
 from pipeline.submission.load import NAME
@@ -111,6 +111,17 @@ class Options:
         )
 
 
+def _as_run(paths: Sequence[Path], rubric_file: Path, options: Options) -> Run:
+    """Return what is graded, with whole paths; a shipped rubric has only a name."""
+    rubric = find_rubric(rubric_file).resolve()
+    return Run(
+        paths=tuple(str(Path(path).resolve()) for path in paths),
+        rubric=rubric.stem if rubric.parent == RUBRICS.resolve() else str(rubric),
+        lateness=str(options.lateness.resolve()) if options.lateness else "",
+        options=options.lasting(),
+    )
+
+
 def grade_class(
     paths: Sequence[Path],
     *,
@@ -150,6 +161,9 @@ def grade_class(
         hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
         with book_of(create=True) as book:
             shown = _pseudonyms(book) if hidden else str
+            run = _as_run(paths, rubric_file, options)
+            if options.gradebook is None and not book.is_graded:
+                save_run(out, run)  # so that a grading that does not end can be continued
             batch = grade_batch(
                 hand_ins,
                 setup=options.setup(rubric, scratch=scratch),
@@ -176,12 +190,6 @@ def grade_class(
             ]
             total = len(hand_ins)
             if options.gradebook is None:
-                late = str(options.lateness.resolve()) if options.lateness else ""
-                absolute = tuple(str(Path(path).resolve()) for path in paths)
-                rubric_path = str(find_rubric(rubric_file).resolve())
-                run = Run(
-                    paths=absolute, rubric=rubric_path, lateness=late, options=options.lasting()
-                )
                 save_run(out, run)
             repeated = write_outputs(book, out, progress=lambda what: progress(total, total, what))
     return Summary(

@@ -105,26 +105,31 @@ def find_hand_ins(
     return tuple(sorted(_with_ids(found, known=known), key=lambda hand_in: hand_in.id))
 
 
-def check_hand_ins(path: Path, *, skip: Iterable[Path] = ()) -> None:
-    """Check that a folder or an archive has something to grade, without unpacking it.
+def check_hand_ins(path: Path, *, skip: Iterable[Path] = ()) -> str:
+    """Return why an archive of one submission cannot be graded, without unpacking it; or "".
+
+    Such an archive becomes a submission with a reason.
 
     Raises
     ------
-    ConfigError : the path does not exist, is a broken archive, or contains nothing to grade.
+    ConfigError : the path does not exist, is a broken archive of a class, or is a folder that
+        contains nothing to grade.
     """
     path = _folder_or_archive(path.resolve())
     if path.is_dir():
         skipped = {one.resolve() for one in skip}
-        found = bool(_in_folder(path, walk=_Walk(skip=skipped, say=silent)))
-    else:
-        try:
-            names = list_members(path, limits=CLASS)
-        except SubmissionError as error:
+        if not _in_folder(path, walk=_Walk(skip=skipped, say=silent)):
+            raise _nothing_to_grade(path)
+        return ""
+    is_class = _holds_a_class(path)
+    try:
+        names = list_members(path, limits=CLASS)
+    except SubmissionError as error:
+        if is_class:
             raise ConfigError(str(error)) from None
-        found = any(name.name == NAME or name.suffix.lower() == ".zip" for name in names)
-        found = found or _holds_a_class(path)
-    if not found:
-        raise _nothing_to_grade(path)
+        return str(error)
+    found = any(name.name == NAME or name.suffix.lower() == ".zip" for name in names)
+    return "" if found or is_class else str(_nothing_to_grade(path))
 
 
 def _nothing_to_grade(path: Path) -> ConfigError:

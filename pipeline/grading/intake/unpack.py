@@ -269,6 +269,8 @@ def _overlap(members: Sequence[zipfile.ZipInfo], *, end: int) -> bool:
     ----------
     end : where the table of contents begins.
     """
+    if not members:
+        return False
     places = sorted((info.header_offset, info.compress_size) for info in members)
     begins = [*(begin for begin, _ in places[1:]), end]
     return any(

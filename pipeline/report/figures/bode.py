@@ -117,10 +117,11 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
     low, high = ax.dataLim.intervaly
     margin = 0.08 * max(high - low, 90.0)
     bottom, top = ax.set_ylim(low - margin, high + margin)
-    # Ticks are at multiples of 90°; with more than five, the labels would touch.
+    # Ticks are at multiples of 45°, 90° or half turns; with more than five, labels would touch.
+    half_turns = 180.0 * max(1, np.ceil((top - bottom) / 900.0))
     labels = top // 90.0 + -bottom // 90.0 + 1
     ax.yaxis.set_major_locator(
-        MultipleLocator(45.0 if high - low <= 90.0 else 90.0 if labels <= 5 else 180.0)
+        MultipleLocator(45.0 if high - low <= 90.0 else 90.0 if labels <= 5 else half_turns)
     )
     ax.set_ylabel("phase [°]")
 

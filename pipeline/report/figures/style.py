@@ -21,7 +21,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from pipeline.arrays import Array
 from pipeline.report.figures import GRID, MEASURED, MODEL, QUIET, SECOND_LINE, Look
@@ -125,6 +125,8 @@ def panels(
             # labels.
             ax.yaxis.set_label_coords((0.16 - left) / width, 0.5)
             ax.xaxis.set_label_coords(0.5, -0.31 / heights[row])
+            for axis in (ax.xaxis, ax.yaxis):  # steps of 2.5 would need a digit more
+                axis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10]))
             ax.tick_params(
                 labelbottom=not share_x or row == len(heights) - 1,
                 labelleft=not share_y or column == 0,
