@@ -256,10 +256,11 @@ def compare(window: FitWindow, modes: Modes) -> Misfit:
         signals += [q[:, :: window.stride], dq[:, :: window.stride]]
         by_shape = shapes * modes.drive
         rest = rest + _real_part(by_shape, signals[0])
-        d_weights += [
-            d_shapes * modes.drive + shapes * modes.d_drive[:, None],
-            by_shape * modes.d_poles[:, None],
-        ]
+        with np.errstate(over="ignore"):  # far from the data; the fit refuses such a step
+            d_weights += [
+                d_shapes * modes.drive + shapes * modes.d_drive[:, None],
+                by_shape * modes.d_poles[:, None],
+            ]
     rest = weighed(rest, window).reshape(-1)
     along = basis.T @ rest
     if not window.at_rest:
