@@ -225,6 +225,7 @@ def open_window(record: Record) -> FitWindow:
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # far from the data, where the fit refuses a step
 def compare(window: FitWindow, modes: Modes) -> Misfit:
     """Compare a chain, given by its modes, with a window.
 
@@ -256,11 +257,10 @@ def compare(window: FitWindow, modes: Modes) -> Misfit:
         signals += [q[:, :: window.stride], dq[:, :: window.stride]]
         by_shape = shapes * modes.drive
         rest = rest + _real_part(by_shape, signals[0])
-        with np.errstate(over="ignore"):  # far from the data; the fit refuses such a step
-            d_weights += [
-                d_shapes * modes.drive + shapes * modes.d_drive[:, None],
-                by_shape * modes.d_poles[:, None],
-            ]
+        d_weights += [
+            d_shapes * modes.drive + shapes * modes.d_drive[:, None],
+            by_shape * modes.d_poles[:, None],
+        ]
     rest = weighed(rest, window).reshape(-1)
     along = basis.T @ rest
     if not window.at_rest:
