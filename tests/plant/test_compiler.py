@@ -97,7 +97,7 @@ def test_the_folders_name_covers_each_file_that_a_compiled_function_uses():
     rooms = set()
     for path in (ROOT / "pipeline").rglob("*.py"):
         text = path.read_text(encoding="utf-8")
-        generates = path.name == "codegen.py"  # writes such functions, and has none
+        generates = path.name == "codegen.py"  # its own functions are not compiled
         if generates or not re.search(r"simulator\.compiler import (inlined|jit)", text):
             continue
         rooms.add(path.parent.name)
