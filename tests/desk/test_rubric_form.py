@@ -89,14 +89,24 @@ def test_a_rubric_changed_meanwhile_is_not_overwritten(visitor, lab):
     assert "# by another" in answer.text
     assert "# mine" in answer.text
     assert lab.read_text(encoding="utf-8").startswith("# by another")
-    new = visitor.post("/rubric/save", file=str(lab), text=mine, seen="new")
-    assert new.status == 409  # it began as a new file, which now exists
+
+
+def test_a_new_rubric_does_not_replace_another_one(visitor, lab):
+    """A new rubric that is saved as an existing file comes back, with a message at its name."""
+    before = lab.read_text(encoding="utf-8")
+    for action in ("save", "check"):
+        text = f"# mine\n{ONE_CART}"
+        new = visitor.post(f"/rubric/{action}", file=str(lab), text=text, seen="new")
+        assert (new.status, new.wrong_fields) == (409, {"file"})
+        assert (new.value("file"), new.value("seen")) == (str(lab), "new")
+        assert "# mine" in new.text
+        assert lab.read_text(encoding="utf-8") == before
 
 
 def test_a_rubric_is_found_in_a_folder_of_any_name(visitor, tmp_path):
     """A rubric is found even if its folder's name has characters that are special in addresses.
 
-    A bad file name is refused.
+    A bad file name is refused at its field, and what was typed comes back.
     """
     folder = tmp_path / "R+D & co #2 100%"
     folder.mkdir()
@@ -105,7 +115,12 @@ def test_a_rubric_is_found_in_a_folder_of_any_name(visitor, tmp_path):
     assert visitor.get(saved.headers["location"]).value("file") == str(path)
     for file in ("", "rubric.txt", "/nowhere/at/all/rubric.toml", "a\x00.toml", "~nosuch/r.toml",
                  "a" * 300 + ".toml"):  # fmt: skip
-        assert visitor.post("/rubric/save", file=file, text="x", seen="new").status == 422
+        for action in ("save", "check", "preview"):
+            text = f"# mine\n{ONE_CART}"
+            answer = visitor.post(f"/rubric/{action}", file=file, text=text, seen="new")
+            assert (answer.status, answer.wrong_fields) == (422, {"file"})
+            assert "# mine" in answer.text
+            assert answer.value("file") == file
 
 
 def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypatch):

@@ -58,6 +58,8 @@ class RubricPage:
 
     Attributes
     ----------
+    file : path of the file, as it was typed if it was refused.
+    refused : why this path was refused, or "".
     seen : version of the file on which the typed text is based.
     now : current text of the file, if somebody has changed it since.
     classes : number and name of each open class.
@@ -65,7 +67,8 @@ class RubricPage:
         graded last in it.
     """
 
-    file: Path
+    file: Path | str
+    refused: str
     typed: RubricDraft
     seen: str
     now: str | None
@@ -103,13 +106,17 @@ def show(ask: PageRequest) -> Response:
 
 def check(ask: PageRequest) -> Response:
     """Show what is wrong with the typed rubric; nothing is saved."""
-    path = _read_rubric_path(ask)
+    path = _read_typed_path(ask)
+    if isinstance(path, Response):
+        return path
     return _show_editor(ask, path, read_draft(ask.form), version=ask.text("seen"))
 
 
 def save(ask: PageRequest) -> Response:
     """Save a valid rubric, unless the file has changed since it was shown."""
-    path, typed, seen = _read_rubric_path(ask), read_draft(ask.form), ask.text("seen")
+    path, typed, seen = _read_typed_path(ask), read_draft(ask.form), ask.text("seen")
+    if isinstance(path, Response):
+        return path
     try:
         if path.exists():
             require_version(rubric_source(path), seen, name=path.name)
@@ -126,11 +133,12 @@ def save(ask: PageRequest) -> Response:
 
 def _show_editor(
     ask: PageRequest,
-    path: Path,
+    path: Path | str,
     typed: RubricDraft,
     *,
     version: str,
     now: str | None = None,
+    refused: str = "",
     status: int = 200,
 ) -> Response:
     """Show the editor.
@@ -139,18 +147,20 @@ def _show_editor(
     ----------
     version : version of the file on which the typed text is based.
     now : current text of the file, if somebody has changed it since.
+    refused : why the path was refused, or "".
     """
     saved = "saved" in ask.request.query_params
     page = RubricPage(
         file=path,
+        refused=ask.user.name_places(refused),
         typed=typed,
         seen=version,
         now=now,
         saved=saved,
         classes=[(n, name_place(place)) for n, place in enumerate(ask.user.gradebooks)],
-        graded=_classes_of(ask, path) if saved else [],
+        graded=_classes_of(ask, Path(path)) if saved else [],
     )
-    return ask.page("rubric", status=status, title=path.name, page=page)
+    return ask.page("rubric", status=status, title=Path(path).name or "A rubric", page=page)
 
 
 def _classes_of(ask: PageRequest, path: Path) -> list[tuple[int, str, Run | None]]:
@@ -168,6 +178,23 @@ def _classes_of(ask: PageRequest, path: Path) -> list[tuple[int, str, Run | None
                 run = replace(run, paths=())
             found.append((n, name_place(place), run))
     return found
+
+
+def _read_typed_path(ask: PageRequest) -> Path | Response:
+    """Return the path in a sent form, or the editor with what was typed if it is refused."""
+    seen = ask.text("seen")
+    try:
+        path = _read_rubric_path(ask)
+        if seen != _NEW or not path.exists():
+            return path
+        refused, status = (
+            f"{path.name}: exists already; choose another name, or open that rubric",
+            409,
+        )
+    except ConfigError as error:
+        refused, status = str(error), 422
+    typed = read_draft(ask.form)
+    return _show_editor(ask, ask.text("file"), typed, version=seen, refused=refused, status=status)
 
 
 def _read_rubric_path(ask: PageRequest) -> Path:
@@ -249,7 +276,9 @@ class RubricPreviewPage:
 
 def preview(ask: PageRequest) -> Response:
     """Show the points of a class under the typed rubric; nothing is saved."""
-    path, typed, seen = _read_rubric_path(ask), read_draft(ask.form), ask.text("seen")
+    path, typed, seen = _read_typed_path(ask), read_draft(ask.form), ask.text("seen")
+    if isinstance(path, Response):
+        return path
     if typed.rubric is None:
         return _show_editor(ask, path, typed, version=seen, status=422)
     number, place = _find_class(ask)
