@@ -38,7 +38,7 @@ from pipeline.output import own_folder, write_file
 from pipeline.processes import serve
 from pipeline.results import Analysis
 from pipeline.submission import load_submission
-from pipeline.submission.load import path_problem
+from pipeline.submission.load import parse_readable, path_problem
 from pipeline.words.progress import Progress
 
 _ACROSS, _HIGH = 120, 32  # width and height of a thumbnail
@@ -307,6 +307,20 @@ def render_notes(folder: str, *, progress: Progress) -> str:
     return str(render_blocks(blocks))
 
 
+def check_repair(folder: str, text: str, *, progress: Progress) -> None:
+    """Check a repaired `submission.toml`; whether its files exist, grading finds out.
+
+    Parameters
+    ----------
+    folder : folder of the team's repairs.
+
+    Raises
+    ------
+    SubmissionError : the text is not a valid submission.
+    """
+    parse_readable(text, folder=Path(folder))
+
+
 def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, Any]:
     """Return the points of a graded class under a different rubric; see `RubricPreview`."""
     from pipeline.grading.gradebook.gradebook import Gradebook
@@ -325,7 +339,7 @@ TASKS: Mapping[str, Callable[..., Any]] = {
         check_numbers, propose_recordings, weigh_recording, publish_grades, check_grading,
         grade_submissions,
         preview_rubric, check_exercise, draw_effect, make_exercises, make_solution,
-        describe_exercise, make_plots, render_notes,
+        describe_exercise, make_plots, render_notes, check_repair,
     )
 }  # fmt: skip
 

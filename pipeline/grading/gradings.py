@@ -191,6 +191,7 @@ def failed(
     authors: Sequence[str] = (),
     settled: bool = True,
     detail: str = "",
+    repaired: str = "",
 ) -> Grading:
     """Return the outcome of a submission that could not be graded.
 
@@ -198,6 +199,7 @@ def failed(
     ----------
     reason : why the submission could not be graded, one cause per line.
     settled : whether the outcome is final; if not, the next run grades the submission again.
+    repaired : see `Grade`.
     """
     lines = (" ".join(line.split()) for line in reason.split("\n"))
     reason = "".join(c if c.isprintable() or c == "\n" else "�" for c in "\n".join(lines))
@@ -209,7 +211,7 @@ def failed(
         authors=people,
         days_late=task.days_late,
         unsettled=not settled,
-    )
+    ).model_copy(update={"repaired": repaired})
     return Grading(
         submission=task.id,
         authors=people,

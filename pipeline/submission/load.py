@@ -77,6 +77,16 @@ def load_submission(path: Path) -> Submission:
     if (problem := file_problem(folder, toml.name)) is not None:
         raise SubmissionError(f"{where}: {problem}")
     text = read_text(toml, where=where, limit=MAX_TOML_BYTES, error=SubmissionError)
+    return parse_readable(text, folder=folder, where=where)
+
+
+def parse_readable(text: str, *, folder: Path, where: str = NAME) -> Submission:
+    """Check the text of a `submission.toml`, and leave out what cannot be read of `[reported]`.
+
+    Raises
+    ------
+    SubmissionError : the submission is invalid elsewhere.
+    """
     try:
         return parse_submission(text, folder=folder, where=where)
     except SubmissionError:

@@ -10,7 +10,17 @@ import pytest
 from pipeline.grading.batch.grade_class import Options
 from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.intake.repairs import FOLDER, Run, read_original, read_run, save_run, text_key
+from pipeline.grading.intake.repairs import (
+    FOLDER,
+    Repair,
+    Run,
+    read_original,
+    read_repairs,
+    read_run,
+    save_repair,
+    save_run,
+    text_key,
+)
 from pipeline.simulated.submission import write_submission
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.desks import at_desk
@@ -72,6 +82,16 @@ def test_a_repaired_file_is_graded_and_stays_repaired(handed_in, tmp_path):
         assert "carts = 1,0" in page
         sent = {"do": "repair", "by": "Ada", "of_text": text_key(original)}
         assert ta.post(TEAM, **sent, text=right, why="").status == 422
+        typos = (
+            original,
+            right.replace("[system]", "[sytem]"),
+            right.replace("carts = 1", "carts ="),
+        )
+        for text in typos:  # a repair with a mistake does not count
+            refused = ta.post(TEAM, **sent, text=text, why=WHY)
+            assert (refused.status, "repair" in refused.wrong_fields) == (422, True)
+            assert text.strip() in unescape(refused.text)
+            assert read_repairs(out, "team-07") == {}
         assert ta.post(TEAM, **{**sent, "of_text": "other"}, text=right, why=WHY).status == 422
         assert ta.post(TEAM, **sent, text=right.replace("\n", "\r\n"), why=WHY).status == 303
         until(lambda: current(out).status == "graded")
@@ -102,6 +122,22 @@ def test_a_repaired_file_is_graded_and_stays_repaired(handed_in, tmp_path):
 
     cartlab_here("remove", out, "team-07", "--erase")
     assert not (out / "repairs" / "team-07").exists()
+
+
+@pytest.mark.slow
+def test_the_history_names_who_repaired_a_file_that_cannot_be_graded(handed_in, tmp_path):
+    """The history names the person and the reason also if the repaired file cannot be graded."""
+    _, path, right = handed_in
+    out = tmp_path / "grades"
+    grade(path, out)
+    original = read_original(out, "team-07")
+    assert original
+    repair = Repair(text=right.replace("carts = 1", "carts = 2"), by="Ada", why=WHY)
+    save_repair(out, "team-07", repair, of=text_key(original))
+    found = grade(path, out)
+    assert (found.status, found.repaired) == ("failed", f"by Ada: {WHY}")
+    said = cartlab_here("history", out, "team-07").stdout
+    assert f"submission.toml repaired by Ada: {WHY}" in said
 
 
 @pytest.mark.slow

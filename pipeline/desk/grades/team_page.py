@@ -42,6 +42,7 @@ from pipeline.grading.gradebook.entry import TOTAL, Entry
 from pipeline.grading.gradebook.history import event_words, to_the_second
 from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.repairs import (
+    FOLDER,
     Repair,
     read_original,
     read_repairs,
@@ -54,6 +55,7 @@ from pipeline.grading.publish.view import renamed_events, view
 from pipeline.grading.rubric import Rubric, find_remarks
 from pipeline.grading.words import WORDS, person_lines, points_text
 from pipeline.output import LOCK
+from pipeline.processes import Failed
 from pipeline.report.html import render_drawing
 from pipeline.submission.load import NAME, file_problem
 from pipeline.words.text import capital
@@ -123,17 +125,16 @@ def _find_next(shown: ClassView, wanted: Filter, team: ClassRow) -> str:
 
 
 def _repair(ask: PageRequest, shown: ClassView, team: ClassRow, *, by: str) -> Response:
-    """Save a repaired `submission.toml` of a team, and grade the class again.
-
-    The text is not parsed here, but by the grading process, which has limits.
-    """
+    """Save a repaired `submission.toml` of a team if it is valid, and grade the class again."""
     place, text = ask.place_or_404(), ask.text("text").replace("\r\n", "\n")
     if not isinstance(place, Path) or shown.names is not None:
         raise HTTPException(404, "this file cannot be repaired here")
     repair = Repair(text=text, by=by, why=ask.text("why"))
     try:
+        repairs = str(place / FOLDER / team.submission)
+        ask.desk.workers.do("check_repair", folder=repairs, text=text)
         save_repair(place, team.submission, repair, of=ask.text("of_text"))
-    except ConfigError as error:
+    except (ConfigError, Failed) as error:
         return _show_page(ask, wrong_repair=str(error), status=422)
     message = "Saved. It counts when the class is graded again."
     if run := read_run(place):

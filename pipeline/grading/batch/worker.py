@@ -33,7 +33,7 @@ _ID = re.compile(r"""\s*id\s*=\s*["'“”„]?([^"'“”#]+)""")
 def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = False) -> Grading:
     """Open, analyse and grade one submission; if it fails, the outcome holds the reason."""
     authors: tuple[str, ...] = ()
-    reason = detail = original = ""
+    reason = detail = original = by = ""
     settled, no_room = True, False
     try:
         with tempfile.TemporaryDirectory(
@@ -43,6 +43,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
             opened = open_submission(sources, Path(folder) / task.id, digest=task.digest)
             original = _handed_in(opened)
             repaired = _repair(opened, task, original)
+            by = f"by {repaired.by}: {repaired.why}" if repaired else ""
             authors = named_authors(opened)
             submission = load_submission(opened)
             original = original if submission.unread or repaired else ""
@@ -54,7 +55,6 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
             notes = [*grade.notes, *asked_note(opened)]
             if repaired:
                 notes.append(f"{NAME} was repaired before grading: {repaired.why}")
-            by = f"by {repaired.by}: {repaired.why}" if repaired else ""
             grade = grade.model_copy(update={"notes": tuple(notes), "repaired": by})
             records = graded.analysis.records if graded.analysis else ()
             drawn, detail = _figures(submission, graded, rubric) if figures else ((), "")
@@ -87,7 +87,13 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
         reason = f"the grader failed: {type(error).__name__}: {quote(str(error))}"
         detail, settled = _traceback(), False
     outcome = failed(
-        task, reason, authors=authors, out_of=rubric.out_of, settled=settled, detail=detail
+        task,
+        reason,
+        authors=authors,
+        out_of=rubric.out_of,
+        settled=settled,
+        detail=detail,
+        repaired=by,
     )
     return replace(outcome, is_disk_full=no_room, original=original)
 

@@ -59,10 +59,11 @@ def _shown(event: Event, *, named: bool) -> Event:
 def _graded(connection: Connection, submission: int) -> Iterator[Event]:
     mine = select(gradings).where(gradings.c.submission_id == submission)
     for row in connection.execute(mine.order_by(gradings.c.id)):
-        text = FAILED + on_one_line(row.reason)
-        if row.status != "failed":
-            grade = read_grade(row.grade)
-            said = [f"{NAME} repaired {grade.repaired}"] if grade.repaired else []
+        grade = read_grade(row.grade)
+        said = [f"{NAME} repaired {grade.repaired}"] if grade.repaired else []
+        if row.status == "failed":
+            text = "; ".join([FAILED + on_one_line(row.reason), *said])
+        else:
             text = ", ".join([*said, *(flag.code for flag in grade.flags)])
         yield Event(at=row.at, what="graded", points=row.points, out_of=row.out_of, text=text)
 
