@@ -1,5 +1,7 @@
 """The TA's pages in a real browser: grading a class by keys, two TAs at once, anonymous names."""
 
+import shutil
+
 import pytest
 from playwright.sync_api import expect
 
@@ -7,6 +9,7 @@ from pipeline.desk.app import DeskServer
 from pipeline.grading.gradebook.gradebook import Gradebook
 from tests.helpers import postgres
 from tests.helpers.grades import fill_book, write_class
+from tests.helpers.grading_students import write_team
 from tests.system import test_desk
 
 show, fits = test_desk.show, test_desk.fits
@@ -195,3 +198,29 @@ def test_two_tas_see_each_others_changes(show):
         with Gradebook(place) as book:
             given = book.entry("team-04").overrides["laws"]
             assert (given.points, given.by) == (1.0, "Ada")
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_chosen_files_stay_when_another_field_is_wrong(show, tmp_path, monkeypatch):
+    """After a wrong field, the form to grade a class keeps the chosen files and what was typed."""
+    monkeypatch.chdir(tmp_path)
+    handed_in = tmp_path / "team-1.zip"
+    team = write_team(tmp_path / "team-1", 1)
+    shutil.make_archive(str(team), "zip", team.parent, team.name)
+    with DeskServer() as server:
+        window = show(server.url)
+        window.goto(f"{window.url}grading/")
+        files, rubric = window.locator("#files"), window.get_by_label("Rubric")
+        files.set_input_files(handed_in)
+        rubric.fill("no-such-rubric")
+        window.get_by_role("button", name="Grade").click()
+        expect(window.locator("#rubric-wrong")).to_be_visible()
+        expect(window.locator("#files-wrong")).to_have_count(0)
+        assert files.evaluate("one => one.files[0].name") == handed_in.name
+        expect(rubric).to_have_value("no-such-rubric")
+        rubric.fill("throne-1dof")
+        window.get_by_role("button", name="Grade").click()
+        window.wait_for_url("**/grades/0/**")
+        expect(window.locator("#teams tbody tr")).to_have_count(1)
+    assert (tmp_path / "grades" / "handed-in" / handed_in.name).is_file()

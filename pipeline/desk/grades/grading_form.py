@@ -105,14 +105,21 @@ def grade_new(ask: PageRequest) -> Response:
         if out is None or wrong:
             return _show(ask, _typed(ask, wrong=wrong, is_first=True))
         if (job := ask.desk.jobs.of(out)) and not job.over:
-            return ask.back(enter(ask.user, out), "This class is being graded already.")
+            return _open_class(ask, out, "This class is being graded already.")
         out.mkdir(OWNERS_FOLDER, exist_ok=True)
         Gradebook(out, create=True).close()  # so that the folder is known as that of a class
         run = _keep_uploads(run, scratch, out)
-    address = enter(ask.user, out)
+    answer = _open_class(ask, out)
     start_grading(ask, run, out)
     save_run(out, run)  # so that a grading that does not end can be continued
-    return ask.back(address)
+    return answer
+
+
+def _open_class(ask: PageRequest, out: Path, *messages: str) -> Response:
+    """Open a class at the desk, and return an answer that leads to its page."""
+    address = enter(ask.user, out)
+    answer = ask.back(address, *messages)
+    return ask.go(address) if "hx-request" in ask.request.headers else answer
 
 
 def grade_again(
@@ -177,7 +184,7 @@ def _list_rubrics(user: User) -> list[tuple[str, str]]:
 
 def _typed(ask: PageRequest, *, wrong: Mapping[str, str], is_first: bool) -> GradingForm:
     """Return the form as it was typed."""
-    if _uploads(ask):
+    if _uploads(ask) and "hx-request" not in ask.request.headers:
         wrong = {"files": "choose the files once more", **wrong}
     return GradingForm(
         paths=ask.text("paths"),
