@@ -540,9 +540,13 @@ def test_feedback_files_are_exported(ta, grades, tmp_path):
         done = export_feedback(book, PLATFORMS["moodle"], tmp_path / "out", roster=roster)
     answer = upload(ta, ROOM + "export", "roster", worksheet, lms="moodle", what="feedback")
     assert answer.status == 200
+    assert 'filename="feedback-moodle.zip"' in answer.headers["content-disposition"]
+    with zipfile.ZipFile(done.files[0]) as archive:
+        expected = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(io.BytesIO(answer.body)) as archive:
-        assert archive.read("feedback-moodle.zip") == done.files[0].read_bytes()
-        assert archive.read("remarks.txt").decode().splitlines() == [r.text for r in done.remarks]
+        found = {name: archive.read(name) for name in archive.namelist()}
+    assert found.pop("remarks.txt").decode().splitlines() == [r.text for r in done.remarks]
+    assert found == expected
     assert ta.post(ROOM + "export", lms="gradescope", what="feedback").status == 422
 
 
@@ -560,6 +564,7 @@ def test_the_export_equals_that_of_the_command(ta, grades, tmp_path, platform):
         expected["remarks.txt"] = f"{said}\n".encode()
     found = {f"{platform}.csv": answer.body}
     if len(expected) > 1:
+        assert f'filename="grades-{platform}.zip"' in answer.headers["content-disposition"]
         with zipfile.ZipFile(io.BytesIO(answer.body)) as archive:
             found = {name: archive.read(name) for name in archive.namelist()}
     assert found == expected

@@ -1,5 +1,6 @@
 """Actions on a whole class: grade again, write files, change points from a table, export."""
 
+import zipfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -71,15 +72,20 @@ def release(ask: PageRequest) -> Response:
 
 
 def export_class(ask: PageRequest) -> Response:
-    """Return grades or feedback for a learning platform: one file, or a zip with remarks."""
+    """Return grades or feedback for a learning platform: one file, or a zip with remarks.
+
+    A zip of feedback files can be uploaded with its remarks: a platform ignores a file whose name
+    belongs to no student.
+    """
     platform = PLATFORMS.get(ask.text("lms"))
     if platform is None:
         raise HTTPException(400, "there is no such platform")
+    what = "feedback" if ask.text("what") == "feedback" else "grades"
     with scratch_folder() as scratch:
         roster = _store_upload(ask, "roster", scratch / "roster.csv")
         out = scratch / "export"
         book, title = open_gradebook(ask), ask.text("title") or None
-        if ask.text("what") == "feedback":
+        if what == "feedback":
             done = export_feedback(book, platform, out, roster=roster)
         else:
             done = export(book, platform, out, title=title, roster=roster)
@@ -87,11 +93,16 @@ def export_class(ask: PageRequest) -> Response:
             (file,) = done.files
             kind = "text/csv" if file.suffix == ".csv" else "application/zip"
             return _download(file.read_bytes(), file.name, kind=kind)
-        files = {file.relative_to(out).as_posix(): file.read_bytes() for file in done.files}
+        if what == "feedback":
+            with zipfile.ZipFile(done.files[0]) as packed:
+                files = {name: packed.read(name) for name in packed.namelist()}
+        else:
+            files = {file.relative_to(out).as_posix(): file.read_bytes() for file in done.files}
         if done.remarks:  # remarks may name students, so they go into the zip, not on a page
             told = "".join(f"{remark.text}\n" for remark in done.remarks)
             files["remarks.txt"] = told.encode()
-    return _download(zip_bytes(files.items()), f"{platform.name}.zip", kind="application/zip")
+    name = f"{what}-{platform.name}.zip"
+    return _download(zip_bytes(files.items()), name, kind="application/zip")
 
 
 def grade(ask: PageRequest) -> Response:
