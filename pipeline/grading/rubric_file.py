@@ -235,6 +235,9 @@ def _contradictions(found: Rubric, ids: Sequence[object]) -> Iterator[tuple[Loca
         yield ("criteria",), "missing; add a [[criteria]] table for each criterion"
     if found.step != round(found.step, 2):
         yield ("step",), f"{found.step:g}: points have at most two decimals"
+    if found.late.percent_per_day > 100:  # not in the model, which reads older gradebooks too
+        percent = f"{found.late.percent_per_day:g}"
+        yield ("late", "percent_per_day"), f"expected a number from 0 to 100, found {percent}"
     if len(found.system.springs) != n + 1:
         yield (
             ("system", "springs"),

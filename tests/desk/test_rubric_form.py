@@ -177,6 +177,8 @@ def test_a_wrong_number_is_shown_at_its_field_and_line(visitor, lab):
     assert answer.status == 422
     assert f'class="result">Line {line}: ' in answer.text
     assert f"see line {line}" in wrongs(answer.text)
+    late = visitor.post("/rubric/save", **sent(page, lab, **{"late.percent_per_day": "150"}))
+    assert (late.status, late.wrong_fields) == (422, {"late-percent_per_day"})
     assert re.search(r'name="criteria.pieces.points"[^>]*value="1.1"[^>]*aria-invalid', answer.text)
     none = visitor.post("/rubric/save", **sent(page, lab, step="half"))
     assert any("'half'" in wrong for wrong in wrongs(none.text))

@@ -101,6 +101,7 @@ MISTAKES = [  # what is replaced in the rubric, line of the error, what the erro
     ("version = 1", "version = 1\nstep = 0.4", 23, r"points \(model\): 1\.5 .* of step"),
     ("version = 1", "version = 1\nstep = 0.125", 2, r"step: 0\.125: "),
     (REQUIRED, f"[flags]\nwrong_state = 1\n{REQUIRED}", 9, "'wrong_state_space'"),
+    (REQUIRED, f"[late]\npercent_per_day = 150\n{REQUIRED}", 9, r"late\.percent_per_day: .*150"),
     (REQUIRED, f"[flags]\nmissing = 2\n{REQUIRED}", 9, r"flags\.missing\.least: .*1"),
     ('check = "final"', 'check = "finla"', 17, "'finla'; .*'final'"),
     ('"K_*"]\n\n[[r', '"K_9"]\n\n[[r', 9, r"required\.final: .*'K_9'"),
