@@ -15,7 +15,7 @@ from pipeline.ingest.read import DUTY_COUNT, Ingested
 from pipeline.results import Assumption, ChainFit, Check, Record
 from pipeline.submission import Submission, System
 from pipeline.submission.load import spring_names
-from pipeline.words.numbers import join_names
+from pipeline.words.numbers import join_names, with_error
 
 Support = Literal["supported", "contradicted", "open"]
 
@@ -48,8 +48,7 @@ def _springs(
         name = f"k_{i}"
         value = values.get(name)
         std = fit.std.get(name) if fit and value is not None else None
-        error = f" ± {std:.1g}" if std else ""
-        number = "" if value is None else f"{name} = {value:.3g}{error} {unit}"
+        number = "" if value is None else f"{name} = {with_error(value, std)} {unit}"
         wrong, shown, misfit = contrary.get(name, ""), "", "leaves a residual above the noise"
         if fit is None or not fit.converged:
             unknown = "no carts were identified"

@@ -74,6 +74,8 @@ def test_stated_values_are_listed_with_their_support():
     assert analysis.chain is not None
     assert found["springs", "1-2"].found == analysis.chain.k[1]
     assert found["springs", "1-2"].found_std
+    value, _, error = found["springs", "1-2"].reason.split()[2:5]
+    assert len(value.partition(".")[2]) == len(error.partition(".")[2])  # decimals
     assert "Assumed" not in terminal_summary(analysis)
 
 

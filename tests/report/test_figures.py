@@ -101,6 +101,34 @@ def test_a_figure_is_valid_svg_with_a_text_alternative():
     assert root.find(f"{SVG}metadata") is None
 
 
+@pytest.mark.parametrize(("carts", "marks"), [(1, {"ωₙ"}), (2, {"a", "b"})])
+def test_resonances_are_marked(carts, marks):
+    """Dotted lines mark the resonances: one of a single cart is ω_n, others have their letters."""
+    root = ElementTree.fromstring(drawn(bode(response_of(carts, 1), carts=carts), alt="Bode"))
+    texts = {"".join(text.itertext()) for text in root.iter(f"{SVG}text")}
+    assert marks <= texts
+    assert not {"n"} & texts
+
+
+def test_the_phase_of_noise_is_drawn_near_that_of_the_signal():
+    """Without a fit, noise whose phase turns on and on is drawn near the phase of the signal."""
+    response = response_of(3, 3)
+    quiet = np.arange(response.omega.size) >= response.omega.size // 2
+    magnitude = np.where(quiet, response.magnitude_std, response.magnitude)
+    turning = np.angle(np.exp(2.5j * np.arange(response.omega.size)))
+    assert response.phase is not None
+    phase = np.where(quiet, turning, response.phase)
+    response = replace(response, magnitude=magnitude, phase=phase)
+    with drawing():
+        _, (ax,) = panels(1.0)
+        plot_phase(ax, response, chain=None)
+    drawn = np.concatenate([np.asarray(line.get_xydata()) for line in ax.lines])
+    last = np.degrees(np.unwrap(phase[~quiet])[-1])
+    of_noise = drawn[drawn[:, 0] >= response.omega[quiet][0], 1]
+    assert of_noise.size >= quiet.sum()
+    assert np.all(np.abs(of_noise - last) <= 180.001)
+
+
 def test_a_measured_phase_is_drawn_near_the_models():
     """A measured phase is shifted by full turns so that it is drawn near the model's phase."""
     response = response_of(3, 3)  # its phase goes down to -540°

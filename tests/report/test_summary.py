@@ -130,6 +130,19 @@ def test_a_failed_check_of_unknown_kind_is_named():
     assert [line.rpartition(" ")[2] for line in (first, second)] == [odd.id, off.id]
 
 
+def test_after_wrong_springs_the_report_is_made_again_before_recording():
+    """If no carts fit and the springs are in doubt, the second step is to make the report again."""
+    springs = Check(
+        kind="springs", parameter="k_2", outcome="fail", value=1.0, limit=0.5, message="Springs?"
+    )
+    fit = Check(kind="fit", part="converged", outcome="fail", value=1.0, limit=0.5, message="No.")
+    plain = replace(make_analysis(1, repeats=1), skipped=())
+    steps = [next_part(replace(plain, checks=checks)) for checks in ((springs,), (springs, fit))]
+    assert [any(fit.id in line for line in lines[:2]) for lines in steps] == [False, False]
+    assert fit.id in steps[1][2]
+    assert len(steps[1]) == len(steps[0]) + 2
+
+
 @pytest.mark.parametrize("drop", ["step", "step sine sweep"])
 def test_without_runs_of_all_carts_the_summary_says_what_to_record(drop):
     """If no run has all carts, the summary says what to record, and names every failed check."""

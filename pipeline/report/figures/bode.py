@@ -100,16 +100,20 @@ def plot_magnitude(
 
 
 def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) -> None:
-    """Plot the phase in degrees, with measured values shifted by full turns towards the fit."""
+    """Plot the phase in degrees, with measured values shifted by full turns towards the fit.
+
+    Without a fit, points above the noise are unwrapped, and the others are shifted towards them.
+    """
     assert response.phase is not None
-    phase = np.unwrap(response.phase)
+    clear = response.has_signal if response.has_signal.any() else np.full(response.omega.size, True)
+    near = np.interp(response.omega, response.omega[clear], np.unwrap(response.phase[clear]))
     if chain:
         omega = _dense(response.omega, chain)
         line = np.unwrap(np.angle(chain.frequency_response(omega)[response.cart - 1]))
         line -= 2 * np.pi * np.round(line[0] / (2 * np.pi))
         ax.plot(omega, np.degrees(line), color=MODEL)
         near = np.interp(response.omega, omega, line)
-        phase = near + (phase - near + np.pi) % (2 * np.pi) - np.pi
+    phase = near + (response.phase - near + np.pi) % (2 * np.pi) - np.pi
     error = (
         None if response.phase_std is None else np.degrees(np.clip(response.phase_std, 0, np.pi))
     )
@@ -199,9 +203,9 @@ def _dense(omega: Array, chain: Chain) -> Array:
 
 
 def _mark_modes(ax: Axes, omega: Array, chain: Chain) -> None:
-    """Mark the resonances omega_a, omega_b, … by dotted lines with their letters."""
+    """Mark the resonances by dotted lines with their letters; of one cart, with its symbol."""
     modes = np.unique(np.round(np.abs(chain.poles[chain.poles.imag > 0]), 9))
-    letters = mode_suffixes(chain.n)
+    letters = mode_suffixes(chain.n) if chain.n > 1 else ["ωₙ"]
     for letter, mode in zip(letters, modes, strict=False):
         if omega.min() < mode < omega.max():
             ax.axvline(mode, color=QUIET, lw=0.8, ls=":")

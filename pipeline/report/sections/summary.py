@@ -429,7 +429,8 @@ def _failed(analysis: Analysis) -> Iterator[Spans]:
             told=rich("".join(f"{message} " for message in messages)),
             names=_names(groups[group]),
         )
-        if group == "input_sign":
+        # Without a fit, correct springs come before new recordings.
+        if group == "input_sign" or (group == "springs" and "fit_converged" in groups):
             yield _WORDS.spans("next_again")
 
 
