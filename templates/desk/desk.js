@@ -62,7 +62,10 @@ const unsaved = (one) => state(one) !== (sent.has(one) ? sent.get(one) : shown(o
 const key = (one) =>
   [one.form?.dataset.row ?? one.form?.id, one.name.replace(/^experiments\.\d+/, ""), switched(one) && one.value].join("\n");
 const typed = (within) => [...within.querySelectorAll("input:not([type=hidden], [type=file]), select, textarea")].filter((one) => one.name);
-const place = (one) => [one.closest("[data-row]")?.dataset.row, one.id.replace(/-\d+$/, "")].join("\n");
+const place = (one) => {
+  const row = one.closest("[data-row]")?.dataset.row;
+  return row === undefined ? one.id : [row, one.id.replace(/-\d+(?=-|$)/, "")].join("\n");
+};
 const around = (one) => (one ? [one, ...around(one.parentElement.closest("details"))] : []);
 const unfold = (one) => around(one.closest("details")).forEach((folded) => (folded.open = true));
 document.addEventListener("htmx:beforeSend", ({ detail }) => {
@@ -78,7 +81,7 @@ document.addEventListener("htmx:beforeSwap", ({ detail }) => {
   if (detail.target.id !== "main") return;
   before = heading();
   const field = document.activeElement, folding = around(detail.requestConfig?.elt.closest(".together")?.closest("details"));
-  typing = field.id && { id: field.id, at: field.selectionStart, to: field.selectionEnd };
+  typing = field.id && { place: place(field), at: field.selectionStart, to: field.selectionEnd };
   left.set(before, {
     typed: new Map(typed(detail.target).filter(unsaved).map((one) => [key(one), state(one)])),
     open: [...detail.target.querySelectorAll("details[id][open]")].filter((one) => !folding.includes(one)).map(place),
@@ -96,7 +99,7 @@ document.addEventListener("htmx:afterSwap", ({ detail }) => {
     if (one.form?.dataset.row) rows.push(one);
   }
   if (heading() !== before) return scrollTo(0, 0); // another page altogether
-  const field = typing && document.getElementById(typing.id);
+  const field = typing && [...detail.target.querySelectorAll("[id]")].find((one) => place(one) === typing.place);
   if (!field || field === document.activeElement) return;
   unfold(field); // the row may now be among the understood ones
   field.focus();

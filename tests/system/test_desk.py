@@ -578,3 +578,5 @@ def test_a_press_on_remove_counts_while_a_note_is_saved(show, tmp_path, press):
         else:
             remove.evaluate("remove => { document.activeElement.blur(); remove.click(); }")
         until(lambda: [one.id for one in load_submission(folder).experiments] == left)
+        expect(window.locator(f"[data-row='{left[0]}']")).to_have_id("row-0")
+        expect(window.locator("details[id^=more-][open]")).to_have_count(0)
