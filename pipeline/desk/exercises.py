@@ -28,17 +28,44 @@ _OWN = "custom chain"
 def check_exercise(
     bench: Mapping[str, str], chosen: Sequence[Mapping[str, Any]], *, progress: Progress
 ) -> dict[str, Any]:
-    """Return the chosen effects on a bench as a form shows them, or what is wrong with them."""
+    """Return the chosen effects on a bench as a form shows them, or what is wrong with them.
+
+    `about` says what is wrong: the `chain`, `fields` of parameters, which hold the reason, or the
+    `effects` together.
+    """
     try:
         plain = _prepare(bench)
     except ConfigError as error:
-        return {"wrong": str(error), "effects": [], "sentences": []}
+        return {"wrong": str(error), "about": "chain", "effects": [], "sentences": []}
     effects = [_describe_effect(plain, entry) for entry in chosen]
     try:
         sentences, wrong = _prepare(bench, [one["hide"] for one in effects]).effect_sentences, ""
     except ConfigError as error:
         sentences, wrong = (), str(error)
-    return {"wrong": wrong, "effects": effects, "sentences": list(sentences)}
+        for one in effects:
+            _find_wrong_parameters(bench, one)
+            wrong = wrong.replace(f"--hide {one['hide']}", one["title"])
+    at_fields = any(p["wrong"] for one in effects for p in one["parameters"])
+    about = "" if not wrong else "fields" if at_fields else "effects"
+    return {"wrong": wrong, "about": about, "effects": effects, "sentences": list(sentences)}
+
+
+def _find_wrong_parameters(bench: Mapping[str, str], one: Mapping[str, Any]) -> None:
+    """Give the reason why an effect is refused to its parameters whose usual value changes it."""
+    if not (wrong := _refusal(bench, one["hide"])):
+        return
+    for p in one["parameters"]:
+        usual = re.sub(rf"\b{p['name']}=[^,]*", f"{p['name']}={p['usual']}", one["hide"])
+        p["wrong"] = wrong if _refusal(bench, usual) != wrong else ""
+
+
+def _refusal(bench: Mapping[str, str], hide: str) -> str:
+    """Return why an effect alone is refused; "" if it is not."""
+    try:
+        _prepare(bench, [hide])
+    except ConfigError as error:
+        return str(error).removeprefix(f"--hide {hide}: ")
+    return ""
 
 
 def draw_effect(bench: Mapping[str, str], hide: str, *, progress: Progress) -> str:
@@ -150,6 +177,7 @@ def _describe_parameter(
     """
     none = parameter.neutral or 0.0
     value = typed.get("value", "") if typed.get("value") != typed.get("usual") else ""
+    value = value.replace(",", ".")  # a comma separates the parameters
     if typed.get("slide", "") != typed.get("was", ""):
         slide = _read_number(typed.get("slide", "")) or 0.0
         value = f"{none + (usual - none) * 10 ** max(-SLIDE, min(SLIDE, slide)):.3g}"
@@ -163,6 +191,7 @@ def _describe_parameter(
         "value": value,
         "usual": f"{usual:.3g}",
         "slide": f"{round(slide, 2) + 0.0:g}",
+        "wrong": "",
     }
 
 

@@ -68,7 +68,7 @@ def test_a_moved_slider_or_a_typed_number_counts():
     assert float(force("throne-2dof", **before, slide="-1")["value"]) == pytest.approx(
         float(usual) / 10, rel=0.01
     )
-    typed = force("throne-2dof", **(before | {"value": "0.004"}), slide="0")
+    typed = force("throne-2dof", **(before | {"value": "0,004"}), slide="0")
     assert typed["value"] == "0.004"
     assert 10 ** float(typed["slide"]) == pytest.approx(0.004 / float(usual), rel=0.02)
     other = force("throne-1dof", **before, slide="0")["value"]
@@ -117,9 +117,33 @@ def test_a_custom_chain_is_used_or_its_error_named(visitor):
     for masses, said in (("2e-4 heavy", "m needs"), ("0 1e-4", "m must")):
         page = shown(visitor, **(chain | {"m": masses}))
         assert (said in page, "/exercises/picture" in page) == (True, False)
-    wrong = FRICTION | {"coulomb_friction.force.value": "-1"}
-    assert "at least 0" in shown(visitor, preset="throne-2dof", **wrong)
-    assert visitor.post("/exercises/make", **wrong, out="x", folders="1", seed="0").status == 422
+        assert 'id="chain-wrong"' in page
+
+
+def test_a_wrong_number_of_an_effect_is_refused_at_its_field(visitor):
+    """A size that is refused has its reason at its field, also if it is wrong beside another."""
+    stiction = {"effect": "stiction", "stiction.velocity.value": "0.1"}
+    weak = {"stiction.force.value": "2e-3", "stiction.static_force.value": "1e-3"}
+    for typed, refused in (
+        ({**FRICTION, "coulomb_friction.force.value": "-1"}, {"coulomb_friction.force"}),
+        ({**FRICTION, "coulomb_friction.force.value": "x"}, {"coulomb_friction.force"}),
+        ({**stiction, **weak}, {"stiction.force", "stiction.static_force"}),
+        ({**stiction, "stiction.velocity.value": "-1"}, {"stiction.velocity"}),
+    ):
+        page = shown(visitor, preset="throne-2dof", **typed)
+        assert set(re.findall(r'aria-describedby="([\w.]+)-wrong"', page)) == refused
+        assert len(re.findall(r'role="alert" id="[\w.]+-wrong"', page)) == len(refused)
+        assert ("--hide" in page, "/exercises/picture" in page) == (False, False)
+        make = {"out": "x", "folders": "1", "seed": "0"}
+        assert visitor.post("/exercises/make", **typed, **make).status == 422
+
+
+def test_two_effects_that_exclude_each_other_are_named_together(visitor):
+    """If no field is wrong alone, the reason is shown above the effects."""
+    chosen = [{"key": key, "place": "1", "sizes": {}} for key in ("coulomb_friction", "stiction")]
+    found = check_exercise({"preset": "throne-2dof"}, chosen, progress=print)
+    assert (found["about"], found["sentences"]) == ("effects", [])
+    assert not any(p["wrong"] for one in found["effects"] for p in one["parameters"])
 
 
 def test_a_picture_is_inert(visitor):

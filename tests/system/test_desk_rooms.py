@@ -228,3 +228,18 @@ def test_a_picture_of_an_effect_is_drawn_on_a_phone(show):
         drawn = window.locator("#coulomb_friction img")
         until(lambda: drawn.evaluate("image => image.naturalWidth") > 100)
         assert fits(window)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_on_a_phone_checkboxes_stay_beside_their_labels(show, tmp_path, monkeypatch):
+    """On a phone, no label of an effect is broken apart from its checkbox."""
+    monkeypatch.chdir(tmp_path)
+    with DeskServer() as server:
+        window = show(server.url, size=PHONE)
+        window.goto(f"{window.url}exercises/")
+        labels = window.locator(".flags > label")
+        expect(labels.first).to_be_visible()
+        pieces = labels.evaluate_all("all => all.map((one) => one.getClientRects().length)")
+        assert pieces == [1] * labels.count()
+        assert fits(window)
