@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.class_lines import ClassNow, ClassRow
-from pipeline.grading.gradebook.gradebook import Gradebook, State
-from pipeline.grading.publish.view import anonymous_line, pseudonyms
+from pipeline.grading.gradebook.decisions import points_lost
+from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.gradebook import ClassNow, Gradebook, State
+from pipeline.grading.publish.view import anonymise, pseudonyms
 from pipeline.grading.rubric import Rubric
 
 
@@ -32,16 +33,16 @@ class ClassView:
         """The pseudonym of each submission, None if names are shown."""
         if not self.rubric.anonymous:
             return None
-        return pseudonyms({one.submission: one.first_key for one in self.now.rows})
+        return pseudonyms({one.submission: one.first_key for one in self.now.entries})
 
     @cached_property
-    def teams(self) -> Mapping[str, ClassRow]:
-        """The teams by the names that pages show."""
-        teams = list(self.now.rows)
+    def teams(self) -> Mapping[str, Entry]:
+        """The teams by the names that pages show; their grades contain no other names."""
+        teams = self.now.entries
         if self.names is not None:  # the order of the real names would reveal them
-            teams = [replace(one, line=anonymous_line(one.line, self.names)) for one in teams]
-            teams.sort(key=lambda team: team.line.submission)
-        return {team.line.submission: team for team in teams}
+            teams = [replace(one, graded=anonymise(one.graded, self.names)) for one in teams]
+            teams.sort(key=lambda team: team.grade.submission)
+        return {team.grade.submission: team for team in teams}
 
     @cached_property
     def lost(self) -> Mapping[str, set[str]]:
@@ -50,16 +51,10 @@ class ClassView:
         A criterion that a person has yet to grade has lost nothing yet.
         """
         lost: dict[str, set[str]] = {asked.id: set() for asked in self.rubric.criteria}
-        whole = {asked.id: asked.points for asked in self.rubric.criteria}
         for name, team in self.teams.items():
             # A failed submission lost no single criterion; the class page counts in the same way.
-            if team.line.status == "failed":
-                continue
-            judged = team.line.judged
-            for key, points in whole.items():
-                if key in team.line.open:
-                    continue
-                if key not in judged or judged[key]["points"] < points:
+            if team.grade.status != "failed":
+                for key in points_lost(team.grade, self.rubric):
                     lost[key].add(name)
         return lost
 

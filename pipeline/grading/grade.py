@@ -135,6 +135,27 @@ class Grade(GradeTable):
     ] = ()
 
     @property
+    def judged(self) -> dict[str, Criterion]:
+        """The results of the criteria, by id, without those that a person has yet to grade."""
+        return {own.id: own for own in self.criteria if own.id not in self.open}
+
+    @property
+    def codes(self) -> tuple[Code, ...]:
+        """The codes of the flags, each once."""
+        return tuple(dict.fromkeys(flag.code for flag in self.flags))
+
+    @property
+    def by_hand(self) -> tuple[str, ...]:
+        """The ids of the criteria with points given by hand, and `total` if that was adjusted."""
+        total = ("total",) if self.adjustments else ()
+        return (*(given.criterion for given in self.overrides), *total)
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether a person should look: there is a flag, or something is not graded."""
+        return bool(self.flags or self.open or self.unsettled) or self.status == "failed"
+
+    @property
     def lost(self) -> frozenset[str]:
         """The judged criteria without full points; an open criterion has lost nothing yet."""
         lost = (criterion.id for criterion in self.criteria if criterion.points < criterion.out_of)
@@ -166,7 +187,7 @@ class Grade(GradeTable):
     @property
     def awaits_grading(self) -> bool:
         """Whether the next run grades the submission again and nobody gave points by hand."""
-        return self.unsettled and not (self.overrides or self.adjustments)
+        return self.unsettled and not self.by_hand
 
     def with_flags(self, *flags: Flag) -> "Grade":
         """Return the grade with further flags; all flags are sorted in the order of `Code`."""

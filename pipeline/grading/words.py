@@ -1,5 +1,8 @@
 """Texts of grading (`templates/words/grading.toml`), and points as text."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from pipeline.grading.grade import Grade
 from pipeline.words.numbers import listing
 from pipeline.words.phrases import phrases
@@ -16,6 +19,12 @@ def waiting_text(grade: Grade) -> str:
     """Return why a submission is not graded yet, and that the next run grades it again."""
     then = WORDS.text("unsettled_then")
     return f"Could not be graded yet: {on_one_line(grade.reason)}. {then}"
+
+
+def slip_of(evidence: Mapping[str, Any]) -> str:
+    """Return the kind of mistake behind a flag, in words; "-" if it is unknown."""
+    others = (WORDS.text(f"title_{code}") for code in evidence.get("together_with", ()))
+    return evidence.get("slip") or " and ".join(others) or "-"
 
 
 def points_text(points: float) -> str:

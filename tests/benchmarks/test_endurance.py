@@ -61,7 +61,7 @@ def test_a_change_of_points_is_stored_exactly_once(book, change, wrong):
     """A confirmed change must be stored exactly once; any other change at most once."""
     found = Found()
     with Gradebook(book) as opened:
-        teams = [one.submission for one in opened.class_now().rows]
+        teams = [one.submission for one in opened.class_now().entries]
 
     check_book(book, Journal(sent=[change]), teams=teams, found=found)
 

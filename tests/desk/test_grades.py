@@ -16,7 +16,6 @@ import pytest
 from pipeline.desk.app import DeskServer
 from pipeline.desk.grades.criteria import point_steps
 from pipeline.grading.grade import Flag
-from pipeline.grading.gradebook.class_lines import GradeSummary
 from pipeline.grading.gradebook.entry import Event
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
@@ -154,15 +153,11 @@ def test_a_class_is_filtered_and_its_lines_are_its_grades(ta, grades):
 
     with Gradebook(grades) as book:
         first = book.class_now()
-        assert [one.line for one in first.rows] == [
-            GradeSummary.of(e.grade) for e in book.entries()
-        ]
+        assert first.entries == list(book.entries())
         book.override("team-03", "laws", 0.25, why="x", by="y")
         second = book.class_now(first)
-        assert [one.line for one in second.rows] == [
-            GradeSummary.of(e.grade) for e in book.entries()
-        ]
-        same = [a is b for a, b in zip(first.rows, second.rows, strict=True)]
+        assert second.entries == list(book.entries())
+        same = [a is b for a, b in zip(first.entries, second.entries, strict=True)]
         assert same.count(False) == 1
 
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.class_lines import GradeSummary, wrong_springs
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.mistakes.state_model import own_chain
-from pipeline.grading.publish.class_page import class_page
+from pipeline.grading.publish.class_page import class_page, wrong_springs
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.chain import Chain
 from pipeline.simulated.hidden import prepare_bench
@@ -140,7 +139,7 @@ def test_a_spring_that_the_rubric_lacks_flags_nobody():
     assert [flag.code for flag in grade.flags] == []
     assert grade.points >= 0.95 * grade.out_of
     assert "wall-1" in wrong_springs([grade.springs, ()])
-    lines = [GradeSummary.of(grade)]
+    lines = [grade]
     assert "wall-1" in class_page(lines, rubric=team.rubric)
     assert wrong_springs([(), ()]) == ""
 

@@ -151,7 +151,7 @@ def test_a_class_is_graded_by_keys(show, tmp_path):
         window.get_by_text("Keys", exact=True).click()
         window.get_by_label("Keys are on").check()
     with Gradebook(grades) as book:
-        seen = [one.reviewed_by for one in book.class_now().rows if one.reviewed_by]
+        seen = [one.reviewed_by for one in book.class_now().entries if one.reviewed_by]
         assert seen == ["Ada"]
         given = {one: book.entry(one).overrides.get("data") for one in teams}
     (own,) = [one for one in given.values() if one]

@@ -114,7 +114,7 @@ class _Override(_Save):
             assert list(given) == sorted(given)
             assert all(points == number % 3 / 2 for number, points in given.items())
             assert set(self.confirmed) <= set(given) <= set(range(1, self.sent + 1))
-            assert len(book.class_now().rows) == 16
+            assert len(book.class_now().entries) == 16
         _whole(self.folder)
 
 

@@ -137,7 +137,7 @@ def _wish(
         raise ConfigError("a team is no longer in the class")
     team = shown.teams[name]
     points = None if typed == _SAME else read_points(typed)
-    if typed == _SAME and asked.id not in team.line.judged:
+    if typed == _SAME and asked.id not in team.grade.judged:
         raise ConfigError(f"{name}: has no points here yet; give points with the comment")
     if points is not None and not 0 <= points <= asked.points:
         raise ConfigError(f"expected 0 to {asked.points:g} points, found {points:g}")
@@ -219,12 +219,12 @@ def _list_rows(
 ) -> list[TeamRow]:
     """Return the teams that pass the filter or were in the form, with points before and after."""
     sent = ask.sent.getlist("team")
-    names = [team.line.submission for team in Filter.read(ask.request.query_params).chosen(shown)]
+    names = [team.grade.submission for team in Filter.read(ask.request.query_params).chosen(shown)]
     names += [str(name) for name in sent if name in shown.teams and name not in names]
     if ask.query("done"):  # the change is done, so nothing is left to preview
         names = []
     if typed == _SAME:  # a criterion that was never judged has no points to keep
-        names = [name for name in names if asked.id in shown.teams[name].line.judged]
+        names = [name for name in names if asked.id in shown.teams[name].grade.judged]
     wishes = [_wish(ask, shown, asked, name, typed=typed) for name in names]
     tried = {both[0].submission: both for both in open_gradebook(ask).preview_all(wishes)}
     began = ask.text("listed") == "1"

@@ -17,8 +17,7 @@ from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing, show_own_page
 from pipeline.desk.users import name_place
 from pipeline.grading.grade import CODES
-from pipeline.grading.gradebook.class_lines import ClassRow
-from pipeline.grading.gradebook.entry import TOTAL
+from pipeline.grading.gradebook.entry import TOTAL, Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import to_the_second
 from pipeline.grading.platforms import PLATFORMS
@@ -58,7 +57,7 @@ def open_gradebook(ask: PageRequest) -> Gradebook:
     return ask.desk.gradebooks.gradebook(ask.place_or_404())
 
 
-def find_team(shown: ClassView, name: str) -> ClassRow:
+def find_team(shown: ClassView, name: str) -> Entry:
     """Return a team by its name as pages show it."""
     team = shown.teams.get(name)
     if team is None:
@@ -89,7 +88,7 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
     chosen = wanted.chosen(shown)
     pages = max(1, -(-len(chosen) // _ROWS))
     page = min(max(_read_number(ask, "page"), 1), pages)
-    graded = sorted(t.line.points for t in shown.teams.values() if t.line.status == "graded")
+    graded = sorted(t.grade.points for t in shown.teams.values() if t.grade.status == "graded")
     titles = {asked.id: capital(asked.title or asked.id) for asked in shown.rubric.criteria}
     unseen = Filter(seen="no").chosen(shown)
     return ask.page(
@@ -100,12 +99,12 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
         points=points_text,
         found=len(chosen),
         total=len(shown.teams),
-        failed=sum(team.line.status == "failed" for team in shown.teams.values()),
-        not_final=not_final([team.line for team in shown.teams.values()]),
+        failed=sum(team.grade.status == "failed" for team in shown.teams.values()),
+        not_final=not_final([team.grade for team in shown.teams.values()]),
         words=WORDS,
         titles=titles,
-        next=unseen[0].line.submission if unseen else "",
-        clean=sum(not team.line.in_doubt for team in unseen),
+        next=unseen[0].grade.submission if unseen else "",
+        clean=sum(not team.grade.in_doubt for team in unseen),
         flags=count_flags(shown),
         lost=count_lost(shown, titles),
         sets=open_gradebook(ask).changed_together()[:_MOST_SETS],
@@ -134,7 +133,7 @@ def show_clean(ask: PageRequest) -> Response:
     return ask.page(
         "clean",
         title="Teams without a remark",
-        teams=[one for one in Filter(seen="no").chosen(shown) if not one.line.in_doubt],
+        teams=[one for one in Filter(seen="no").chosen(shown) if not one.grade.in_doubt],
         points=points_text,
         titles={asked.id: capital(asked.title or asked.id) for asked in shown.rubric.criteria},
         signature=find_signature(ask),
@@ -143,7 +142,7 @@ def show_clean(ask: PageRequest) -> Response:
 
 def count_flags(shown: ClassView) -> list[Counted]:
     """Return the flags of a class, the most common first."""
-    found = Counter(code for team in shown.teams.values() for code in team.line.codes)
+    found = Counter(code for team in shown.teams.values() for code in team.grade.codes)
     common = sorted(found, key=lambda code: (-found[code], CODES.index(code)))
     titles = {code: capital(WORDS.text(f"title_{code}")) for code in common}
     return [Counted(key=code, title=titles[code], many=found[code]) for code in common]
@@ -208,7 +207,7 @@ def draw_distribution(ask: PageRequest) -> Response:
 
 
 def _distribution(shown: ClassView) -> str:
-    points = [t.line.points for t in shown.teams.values() if t.line.status == "graded"]
+    points = [t.grade.points for t in shown.teams.values() if t.grade.status == "graded"]
     with drawing():
         figure = distribution_figure(points, out_of=shown.rubric.out_of)
         alt = "Histogram of the points."
@@ -220,26 +219,26 @@ def show_class_page(ask: PageRequest) -> Response:
     book = open_gradebook(ask)
 
     def draw(shown: ClassView) -> str:
-        teams = shown.teams.values()
-        own = {team.submission: team for team in teams}
-        flags = {name: one.shared for name, one in sorted(own.items()) if one.shared}
+        own = {entry.submission: entry for entry in shown.now.entries}
+        flags = {
+            name: flag
+            for name in sorted(own)
+            for flag in own[name].graded.flags
+            if flag.code == "shared_data"
+        }
         clusters = find_clusters(flags)
         if shown.names is not None:
             clusters = renamed(clusters, shown.names, other=STRANGER)
         doubles = repeated_authors_of(
             book,
-            {name: one.line.authors for name, one in own.items()},
+            {team.submission: team.grade.authors for team in shown.teams.values()},
             gradings={name: one.grading for name, one in own.items()},
             names=shown.names,
         )
-        names = {team.submission: team.line.submission for team in teams}
-        numbers = {
-            names[entry.submission]: recomputed_numbers(entry.grade, rubric=shown.rubric)
-            for entry in book.entries()
-            if entry.submission in names
-        }
+        grades = [team.grade for team in shown.teams.values()]
+        numbers = {g.submission: recomputed_numbers(g, rubric=shown.rubric) for g in grades}
         return class_page(
-            [team.line for team in teams],
+            grades,
             rubric=shown.rubric,
             repeated_authors=doubles,
             clusters=clusters,

@@ -7,15 +7,15 @@ from urllib.parse import urlencode
 
 from pipeline.desk.gradebooks import ClassView
 from pipeline.grading.grade import CODES
-from pipeline.grading.gradebook.class_lines import ClassRow
-from pipeline.grading.words import WORDS
+from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.words import WORDS, slip_of
 
-_STATES: Mapping[str, tuple[str, Callable[[ClassRow], bool]]] = {
-    "failed": ("could not be graded", lambda team: team.line.status == "failed"),
-    "late": ("late", lambda team: team.line.days_late > 0),
-    "hand": ("changed by hand", lambda team: bool(team.line.by_hand)),
-    "open": ("not final", lambda team: bool(team.line.open)),
-    "remark": ("with a remark", lambda team: bool(team.line.codes)),
+_STATES: Mapping[str, tuple[str, Callable[[Entry], bool]]] = {
+    "failed": ("could not be graded", lambda team: team.grade.status == "failed"),
+    "late": ("late", lambda team: team.grade.days_late > 0),
+    "hand": ("changed by hand", lambda team: bool(team.grade.by_hand)),
+    "open": ("not final", lambda team: bool(team.grade.open)),
+    "remark": ("with a remark", lambda team: bool(team.grade.codes)),
 }
 _SEEN = {"no": "not yet reviewed", "yes": "reviewed"}
 _ORDERS = {
@@ -60,7 +60,7 @@ class Filter:
         """The query of an address that contains this filter."""
         return urlencode({name: value for name, value in asdict(self).items() if value})
 
-    def chosen(self, shown: ClassView) -> list[ClassRow]:
+    def chosen(self, shown: ClassView) -> list[Entry]:
         """Return the teams that pass the filter, in its order."""
         return [team for team in self.ordered(shown) if self._takes(team, shown)]
 
@@ -71,47 +71,48 @@ class Filter:
         """
         before, after, passed = "", "", False
         for team in self.ordered(shown):
-            if team.line.submission == name:
+            if team.grade.submission == name:
                 passed = True
             elif self._takes(team, shown):
                 if passed:
-                    after = team.line.submission
+                    after = team.grade.submission
                     break
-                before = team.line.submission
+                before = team.grade.submission
         return before, after
 
-    def ordered(self, shown: ClassView) -> Sequence[ClassRow]:
+    def ordered(self, shown: ClassView) -> Sequence[Entry]:
         """Return the whole class in the order of the filter."""
         teams = list(shown.teams.values())
         if self.order not in _ORDERS or not self.order:
-            teams.sort(key=lambda t: (bool(t.reviewed_by), not t.line.in_doubt, t.line.points))
+            teams.sort(key=lambda t: (bool(t.reviewed_by), not t.grade.in_doubt, t.grade.points))
         elif self.order == "points":
-            teams.sort(key=lambda team: team.line.points)
+            teams.sort(key=lambda team: team.grade.points)
         elif self.order == "late":
-            teams.sort(key=lambda team: -team.line.days_late)
+            teams.sort(key=lambda team: -team.grade.days_late)
         return teams
 
-    def _takes(self, team: ClassRow, shown: ClassView) -> bool:
-        line = team.line
-        if self.flag and self.flag not in line.codes:
+    def _takes(self, team: Entry, shown: ClassView) -> bool:
+        grade = team.grade
+        if self.flag and self.flag not in grade.codes:
             return False
-        if self.slip and (self.flag, self.slip) not in line.slips:
+        kinds = (slip_of(flag.evidence) for flag in grade.flags if flag.code == self.flag)
+        if self.slip and self.slip not in kinds:
             return False
         if self.seen in _SEEN and bool(team.reviewed_by) != (self.seen == "yes"):
             return False
         if self.state in _STATES and not _STATES[self.state][1](team):
             return False
-        if self.lost and line.submission not in shown.lost.get(self.lost, ()):
+        if self.lost and grade.submission not in shown.lost.get(self.lost, ()):
             return False
         wanted = self.q.casefold()
         return not wanted or any(
-            wanted in text.casefold() for text in (line.submission, *line.authors)
+            wanted in text.casefold() for text in (grade.submission, *grade.authors)
         )
 
     def fields(self, shown: ClassView) -> list[dict]:
         """Return the fields of the form, with their choices and the number of teams for each."""
         teams = list(shown.teams.values())
-        flags = Counter(code for team in teams for code in team.line.codes)
+        flags = Counter(code for team in teams for code in team.grade.codes)
         common = sorted(flags, key=lambda code: (-flags[code], CODES.index(code)))
         seen = sum(bool(team.reviewed_by) for team in teams)
         numbers = {"no": len(teams) - seen, "yes": seen}

@@ -40,7 +40,7 @@ def act(ask: PageRequest) -> Response:
         elif what == "answer":
             points = _read_points(ask.text("points"))
             book.answer(name, criterion, points, text=ask.text("text"), by=by, version=seen)
-            message = f"Answered: {team.line.submission}, {_find_title(shown.rubric, criterion)}."
+            message = f"Answered: {team.grade.submission}, {_find_title(shown.rubric, criterion)}."
         else:
             raise HTTPException(400, "there is no such button")
     except Conflict as conflict:

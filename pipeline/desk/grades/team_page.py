@@ -36,7 +36,6 @@ from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade
-from pipeline.grading.gradebook.class_lines import ClassRow, slip_of
 from pipeline.grading.gradebook.decisions import Conflict, read_points
 from pipeline.grading.gradebook.entry import TOTAL, Entry
 from pipeline.grading.gradebook.history import event_words, to_the_second
@@ -51,9 +50,9 @@ from pipeline.grading.intake.repairs import (
     text_key,
 )
 from pipeline.grading.publish.class_page import feedback_link
-from pipeline.grading.publish.view import renamed_events, view
+from pipeline.grading.publish.view import renamed_events
 from pipeline.grading.rubric import Rubric, find_remarks
-from pipeline.grading.words import WORDS, person_lines, points_text
+from pipeline.grading.words import WORDS, person_lines, points_text, slip_of
 from pipeline.output import LOCK
 from pipeline.processes import Failed
 from pipeline.report.html import render_drawing
@@ -81,16 +80,16 @@ def act(ask: PageRequest) -> Response:
     if what == "unsee":
         book.set_reviewed(name, by=by, reviewed=False)
     if what in ("sign", "unsee"):
-        return ask.back(write_address(ask, team.line.submission))
+        return ask.back(write_address(ask, team.grade.submission))
     if what == "accept":
-        seen = ask.text("version") or team.version
+        seen = ask.text("version") or team.whole_version
         if book.accept_all({name: seen}, by=by).kept:
-            text = f"{team.line.submission}: changed since this page was shown. Look again."
-            return ask.back(write_address(ask, team.line.submission), text)
+            text = f"{team.grade.submission}: changed since this page was shown. Look again."
+            return ask.back(write_address(ask, team.grade.submission), text)
         wanted = Filter.read(ask.request.query_params)
         after = _find_next(shown, wanted, team)
         to = write_address(ask, after) if after else f"{ask.here}?{wanted.query}"
-        return ask.back(to, f"{team.line.submission}: accepted.")
+        return ask.back(to, f"{team.grade.submission}: accepted.")
     criterion, seen = TOTAL if what == "adjust" else ask.text("criterion"), ask.text("seen")
     if what == "repair":
         return _repair(ask, shown, team, by=by)
@@ -106,25 +105,27 @@ def act(ask: PageRequest) -> Response:
         else:
             raise HTTPException(400, "there is no such button")
     except Conflict as conflict:
-        return _show_conflict(ask, shown, team, conflict)
+        return _show_conflict(ask, team.grade.submission, conflict)
     except ConfigError as error:
         text = str(error).replace(" (--why)", "").replace(" (--by)", "")
         return _show_page(ask, wrong=text, status=422)
     if what == "adjust":
-        return ask.back(f"{write_address(ask, team.line.submission)}#total", "Saved.", place=_TOTAL)
-    to = write_address(ask, team.line.submission, criterion=criterion)
+        return ask.back(
+            f"{write_address(ask, team.grade.submission)}#total", "Saved.", place=_TOTAL
+        )
+    to = write_address(ask, team.grade.submission, criterion=criterion)
     done = "Undone." if what == "undo" else "Saved."
     return ask.back(f"{to}#chosen", done, place=_POINTS)
 
 
-def _find_next(shown: ClassView, wanted: Filter, team: ClassRow) -> str:
+def _find_next(shown: ClassView, wanted: Filter, team: Entry) -> str:
     """Return the team to review after this one: the next that is left, or the first; "" if none."""
     left = wanted if wanted.seen else replace(wanted, seen="no")
-    after = left.beside(shown, team.line.submission)[1]
-    return after or next((o.line.submission for o in left.chosen(shown) if o != team), "")
+    after = left.beside(shown, team.grade.submission)[1]
+    return after or next((o.grade.submission for o in left.chosen(shown) if o != team), "")
 
 
-def _repair(ask: PageRequest, shown: ClassView, team: ClassRow, *, by: str) -> Response:
+def _repair(ask: PageRequest, shown: ClassView, team: Entry, *, by: str) -> Response:
     """Save a repaired `submission.toml` of a team if it is valid, and grade the class again."""
     place, text = ask.place_or_404(), ask.text("text").replace("\r\n", "\n")
     if not isinstance(place, Path) or shown.names is not None:
@@ -141,11 +142,11 @@ def _repair(ask: PageRequest, shown: ClassView, team: ClassRow, *, by: str) -> R
         with suppress(Busy):  # another job is running in this folder
             start_grading(ask, run, place)
             message = "Saved. The team is being graded again: load this page again in a moment."
-    return ask.back(write_address(ask, team.line.submission), message)
+    return ask.back(write_address(ask, team.grade.submission), message)
 
 
 def _show_repair(
-    ask: PageRequest, shown: ClassView, team: ClassRow, *, wrong: str
+    ask: PageRequest, shown: ClassView, team: Entry, *, wrong: str
 ) -> dict[str, str] | None:
     """Return what the form for the repair of `submission.toml` shows; None if it is not offered."""
     place = ask.place_or_404()
@@ -194,9 +195,8 @@ def _show_page(
 ) -> Response:
     shown = read_class(ask)
     team = find_team(shown, ask.query("of"))
-    book, name = open_gradebook(ask), team.line.submission
-    now = book.entry(team.submission)
-    grade = view(now, "staff", names=shown.names).grade
+    book, name = open_gradebook(ask), team.grade.submission
+    now, grade = team, team.grade
     _, events = book.history(team.submission, named=not now.rubric.anonymous)
     if shown.names is not None:
         events = renamed_events(events, team.submission, name)
@@ -361,11 +361,9 @@ def _same_slip(shown: ClassView, flag: Flag, *, lost: str) -> tuple[Filter, str]
     return same, f"{title}: {'of no known kind' if slip == '-' else slip}"
 
 
-def _show_conflict(
-    ask: PageRequest, shown: ClassView, team: ClassRow, conflict: Conflict
-) -> Response:
+def _show_conflict(ask: PageRequest, name: str, conflict: Conflict) -> Response:
     """Show what a person typed next to the current state; nothing was changed."""
-    now = open_gradebook(ask).entry(team.submission)
+    now = find_team(read_class(ask), name)
     criterion = ask.text("criterion")
     titles = {asked.id: asked.title for asked in now.rubric.criteria}
     own = next((c for c in now.grade.criteria if c.id == criterion), None)
@@ -373,7 +371,7 @@ def _show_conflict(
     return ask.page(
         "conflict",
         status=409,
-        title=f"{team.line.submission}: {capital(titles.get(criterion) or criterion)}",
+        title=f"{name}: {capital(titles.get(criterion) or criterion)}",
         typed={
             "points": "undo" if undoing else ask.text("other") or ask.text("points"),
             "why": ask.text("why"),
@@ -385,7 +383,7 @@ def _show_conflict(
             "by": conflict.now.by if conflict.now else "cartlab",
         },
         # With a fragment, the browser would stay on this page without loading it again.
-        back=write_address(ask, team.line.submission, criterion=criterion),
+        back=write_address(ask, name, criterion=criterion),
     )
 
 

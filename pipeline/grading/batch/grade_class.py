@@ -12,12 +12,12 @@ from typing import Any
 
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.batch.runner import Executor, Progress, grade_batch, run_here, silent
-from pipeline.grading.gradebook.class_lines import wrong_springs
 from pipeline.grading.gradebook.database import Lost
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch, Example, Setup
 from pipeline.grading.intake.find import HandIn, find_hand_ins, read_late_table, settle_lateness
 from pipeline.grading.intake.repairs import Run, save_run
+from pipeline.grading.publish.class_page import wrong_springs
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.publish.view import STRANGER, hidden_reason, pseudonyms_in
 from pipeline.grading.rubric import Rubric

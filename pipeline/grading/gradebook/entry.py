@@ -88,38 +88,6 @@ class Request:
         return self.events[-1].what
 
 
-def newest_points(events: Iterable[Event]) -> dict[str, Event]:
-    """Return the last points, comment or adjustment given by hand, by criterion."""
-    return {event.criterion: event for event in events if event.what in POINTS}
-
-
-def requests_of(events: Iterable[Event]) -> dict[str, Request]:
-    """Return the requests among the events, by criterion."""
-    asked: dict[str, list[Event]] = {}
-    for event in events:
-        if event.what in REQUESTS:
-            asked.setdefault(event.criterion, []).append(event)
-    return {id_: Request(criterion=id_, events=tuple(own)) for id_, own in asked.items()}
-
-
-def reviewer(events: Iterable[Event], grading: int) -> str:
-    """Return the name of the person who marked a grading as reviewed, or ""."""
-    marks = [event for event in events if event.grading == grading]
-    return marks[-1].by if marks and marks[-1].what == "reviewed" else ""
-
-
-def whole_version(grading: int, events: Iterable[int], *, is_shared: bool) -> str:
-    """Return the version of all that is known of a submission.
-
-    It changes with every event, and when recordings are found to be shared.
-
-    Parameters
-    ----------
-    events : numbers of the events about the submission.
-    """
-    return f"{grading}.{max(events, default=0)}.{int(is_shared)}"
-
-
 def hide_people(text: str, people: Iterable[str]) -> str:
     """Return a text in which the names in `people` are replaced."""
     known = "|".join(re.escape(one) for one in people if one)
@@ -241,7 +209,7 @@ class Entry:
     @cached_property
     def given(self) -> Mapping[str, Event]:
         """The last change by hand of each criterion, and of the total under `TOTAL`."""
-        return newest_points(self._theirs)
+        return {event.criterion: event for event in self._theirs if event.what in POINTS}
 
     @cached_property
     def overrides(self) -> Mapping[str, Event]:
@@ -262,12 +230,17 @@ class Entry:
     @cached_property
     def requests(self) -> Mapping[str, Request]:
         """The requests for a review, by criterion."""
-        return requests_of(self._theirs)
+        asked: dict[str, list[Event]] = {}
+        for event in self._theirs:
+            if event.what in REQUESTS:
+                asked.setdefault(event.criterion, []).append(event)
+        return {id_: Request(criterion=id_, events=tuple(own)) for id_, own in asked.items()}
 
     @property
     def reviewed_by(self) -> str:
         """Name of the person who marked the grading as reviewed, or ""."""
-        return reviewer(self.events, self.grading)
+        marks = [event for event in self.events if event.grading == self.grading]
+        return marks[-1].by if marks and marks[-1].what == "reviewed" else ""
 
     def changes(self, criterion: str) -> list[Event]:
         """Return all changes by hand of a criterion, oldest first."""
@@ -280,9 +253,12 @@ class Entry:
 
     @property
     def whole_version(self) -> str:
-        """Version of all that is known of the submission; see the function of this name."""
-        is_shared = any(flag.code == "shared_data" for flag in self.graded.flags)
-        return whole_version(self.grading, [one.id for one in self.events], is_shared=is_shared)
+        """Version of all that is known of the submission.
+
+        It changes with every event, and when recordings are found to be shared.
+        """
+        newest = max((event.id for event in self.events), default=0)
+        return f"{self.grading}.{newest}.{int('shared_data' in self.graded.codes)}"
 
     def request_version(self, criterion: str) -> str:
         """Return the version of a request, which an answer must name."""

@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from sqlalchemy import Connection, Row, func, select
 
 from pipeline.errors import ConfigError
+from pipeline.grading.class_frame import class_frame
 from pipeline.grading.grade import Grade, read_grade
 from pipeline.grading.gradebook import decisions
-from pipeline.grading.gradebook.class_lines import ClassNow, GradeSummary, class_frame
 from pipeline.grading.gradebook.database import Database
 from pipeline.grading.gradebook.decisions import Conflict, RequestRefused, WantedPoints
 from pipeline.grading.gradebook.entry import (
@@ -48,10 +48,10 @@ from pipeline.grading.gradebook.rows import (
     pages,
     points_of,
     read_entries,
+    read_entry,
     read_events,
     read_figures,
     read_flag,
-    read_line,
     read_members,
     read_prints,
     read_rubric,
@@ -112,6 +112,25 @@ class Queue:
     settled: Sequence[tuple[Entry, Request]]
     n_waiting: int
     n_settled: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassNow:
+    """The class list with current grades.
+
+    Attributes
+    ----------
+    made_of : the entries in order, by the data that each was made from; an entry is valid until
+        they change.
+    """
+
+    rubric: Rubric
+    made_of: Mapping[tuple[Any, ...], Entry]
+
+    @property
+    def entries(self) -> list[Entry]:
+        """The entries in the order of the class list."""
+        return list(self.made_of.values())
 
 
 class Gradebook:
@@ -354,8 +373,7 @@ class Gradebook:
 
     def to_frame(self) -> "pd.DataFrame":
         """Return the class list, one row per submission and criterion; see `class_frame`."""
-        lines = (GradeSummary.of(entry.grade) for entry in self.entries())
-        return class_frame(lines, rubric=self.rubric)
+        return class_frame((entry.grade for entry in self.entries()), rubric=self.rubric)
 
     def by_other_rubrics(self) -> list[str]:
         """Return the submissions of the class list that were graded with another rubric."""
@@ -434,15 +452,14 @@ class Gradebook:
 
         Parameters
         ----------
-        before : an earlier result, whose unchanged lines are reused.
+        before : an earlier result, whose unchanged entries are reused.
         """
         with self._database.reading() as connection:
             last = self._last(connection)
             rubric, members = read_rubric(last), in_class(last)
             done = read_events(connection, events.c.submission_id.in_(members))
             keys = first_keys(connection, members)
-            known = before.rows if before and before.rubric == rubric else ()
-            made = {row.made_of: row for row in known}
+            known = before.made_of if before and before.rubric == rubric else {}
             columns = gradings.c.id, gradings.c.at, gradings.c.submission_id
             made_of = {
                 row.position: (
@@ -450,20 +467,22 @@ class Gradebook:
                 )
                 for row in connection.execute(class_list(last, *columns))
             }  # fmt: skip
-            listed = {at: made[of] for at, of in made_of.items() if of in made}
+            listed = {at: known[of] for at, of in made_of.items() if of in known}
             rows = class_list(last)
             if listed:
-                new = [at for at in made_of if at not in listed]
-                rows = rows.where(entries.c.position.in_(new))
-            for row in connection.execute(rows):
-                listed[row.position] = read_line(
-                    row,
-                    done.get(row.submission_id, ()),
-                    rubric=rubric,
-                    first_key=keys[row.submission_id],
-                    made_of=made_of[row.position],
+                rows = rows.where(
+                    entries.c.position.in_([at for at in made_of if at not in listed])
                 )
-            return ClassNow(rubric=rubric, rows=tuple(listed[at] for at in made_of))
+            for row in connection.execute(rows):
+                number = row.submission_id
+                listed[row.position] = read_entry(
+                    row,
+                    done.get(number, ()),
+                    shared=read_flag(row.shared),
+                    rubric=rubric,
+                    first_key=keys[number],
+                )
+            return ClassNow(rubric=rubric, made_of={of: listed[at] for at, of in made_of.items()})
 
     # ------------------------------------------------------------------ what people do
 
@@ -650,7 +669,7 @@ class Gradebook:
 
         Parameters
         ----------
-        seen : version of each submission that the person saw, from `ClassRow.version`.
+        seen : version of each submission that the person saw, from `Entry.whole_version`.
         """
         at = self._at()
         with self._database.changing() as connection:

@@ -6,7 +6,6 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields, replace
-from typing import Any
 
 from pydantic import ValidationError
 from sqlalchemy import (
@@ -24,9 +23,8 @@ from sqlalchemy import (
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, read_grade
-from pipeline.grading.gradebook.class_lines import ClassRow, GradeSummary
 from pipeline.grading.gradebook.database import Database
-from pipeline.grading.gradebook.entry import REQUESTS, Entry, Event, newest_points, reviewer
+from pipeline.grading.gradebook.entry import REQUESTS, Entry, Event
 from pipeline.grading.gradebook.schema import (
     batches,
     drop_copied,
@@ -239,27 +237,6 @@ def read_events(connection: Connection, *where: ColumnElement) -> dict[int, list
         number = values.pop("submission_id")
         found[number].append(Event(**values))
     return found
-
-
-def read_line(
-    row: Row, done: Sequence[Event], *, rubric: Rubric, first_key: str, made_of: tuple[Any, ...]
-) -> ClassRow:
-    """Return a line of the class list with only the parts that a table of the class needs."""
-    shared = read_flag(row.shared)
-    if newest_points(done):  # only then the whole grade is needed
-        line = GradeSummary.of(read_entry(row, done, shared=shared, rubric=rubric).grade)
-    else:
-        line = GradeSummary.model_validate_json(row.grade)
-        line = line.sharing() if shared else line
-    return ClassRow(
-        line=line,
-        submission=row.name,
-        grading=row.id,
-        reviewed_by=reviewer(done, row.id),
-        shared=shared,
-        first_key=first_key,
-        made_of=made_of,
-    )
 
 
 def first_keys(connection: Connection, submitted: Iterable[int] | Select) -> dict[int, str]:

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 from urllib.parse import quote
@@ -10,8 +10,8 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline import __version__
-from pipeline.grading.grade import CODES, Code
-from pipeline.grading.gradebook.class_lines import GradeSummary, class_frame, wrong_springs
+from pipeline.grading.class_frame import class_frame
+from pipeline.grading.grade import CODES, Code, Grade
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.class_questions import Distant, RepeatedAuthors
 from pipeline.grading.similarity.shared_data import Cluster
@@ -43,7 +43,7 @@ _NAMED = 8  # largest number of submissions or recordings in one row
 
 
 def class_page(
-    lines: Sequence[GradeSummary],
+    grades: Sequence[Grade],
     *,
     rubric: Rubric,
     repeated_authors: Sequence[RepeatedAuthors] = (),
@@ -51,7 +51,7 @@ def class_page(
     distant: Sequence[Distant] = (),
 ) -> str:
     """Return `class.html`; the same class gives the same bytes."""
-    frame = class_frame(lines, rubric=rubric)
+    frame = class_frame(grades, rubric=rubric)
     graded = frame.loc[frame["status"] == "graded"]
     points = graded.drop_duplicates("submission").loc[:, "total"]
     parts: list[Part] = [
@@ -59,15 +59,15 @@ def class_page(
             "summary",
             "Summary",
             lambda page: [
-                *_board(lines, points, rubric),
+                *_board(grades, points, rubric),
                 *_points(page, points, rubric),
-                *_to_look_at(lines, repeated_authors, distant),
+                *_to_look_at(grades, repeated_authors, distant),
             ],
         ),
-        ("mistakes", "Most common mistakes", lambda page: _mistakes(page, lines)),
-        ("shared", "Shared recordings and numbers", lambda page: _shared(page, lines, clusters)),
+        ("mistakes", "Most common mistakes", lambda page: _mistakes(page, grades)),
+        ("shared", "Shared recordings and numbers", lambda page: _shared(page, grades, clusters)),
         ("criteria", "Criteria", lambda page: _criteria(page, graded, rubric)),
-        ("class", "Everybody", lambda page: _everybody(page, lines)),
+        ("class", "Everybody", lambda page: _everybody(page, grades)),
     ]
     document = Document(
         title=clean(rubric.title) or "The class",
@@ -79,10 +79,10 @@ def class_page(
     return render_html(document)
 
 
-def _board(lines: Sequence[GradeSummary], points: "pd.Series", rubric: Rubric) -> list[Block]:
-    failed = [line for line in lines if line.status == "failed"]
+def _board(grades: Sequence[Grade], points: "pd.Series", rubric: Rubric) -> list[Block]:
+    failed = [grade for grade in grades if grade.status == "failed"]
     tiles = [
-        Tile(spans("Submissions"), spans(str(len(lines))), url="#class" if lines else ""),
+        Tile(spans("Submissions"), spans(str(len(grades))), url="#class" if grades else ""),
         Tile(
             spans("Could not be graded"),
             spans(str(len(failed))),
@@ -92,7 +92,7 @@ def _board(lines: Sequence[GradeSummary], points: "pd.Series", rubric: Rubric) -
     if len(points):
         out_of = points_text(rubric.out_of)
         of = WORDS.text("of_those_graded", n=len(points)) if failed else ""
-        remarks = sum(line.status == "graded" and bool(line.codes) for line in lines)
+        remarks = sum(grade.status == "graded" and bool(grade.codes) for grade in grades)
         tiles += [
             Tile(spans(f"Mean{of}"), spans(f"{points.mean():.2f} of {out_of}")),
             Tile(spans(f"Median{of}"), spans(f"{points.median():.2f} of {out_of}")),
@@ -102,19 +102,19 @@ def _board(lines: Sequence[GradeSummary], points: "pd.Series", rubric: Rubric) -
 
 
 def _to_look_at(
-    lines: Sequence[GradeSummary], repeated: Sequence[RepeatedAuthors], distant: Sequence[Distant]
+    grades: Sequence[Grade], repeated: Sequence[RepeatedAuthors], distant: Sequence[Distant]
 ) -> list[Block]:
     """Return what to look at: springs, failures, authors in several teams, unusual carts."""
-    failed = [line for line in lines if line.status == "failed"]
+    failed = [grade for grade in grades if grade.status == "failed"]
     blocks: list[Block] = []
-    if asked := wrong_springs(line.springs for line in lines if line.status == "graded"):
+    if asked := wrong_springs(grade.springs for grade in grades if grade.status == "graded"):
         blocks.append(paragraph(capital(asked)))
-    if told := not_final(lines):
+    if told := not_final(grades):
         blocks.append(paragraph(told))
     if failed:
         reasons = bullet_list(
-            spans(_link(line.submission), f": {clean(on_one_line(line.reason))}", _by_hand(line))
-            for line in failed
+            spans(_link(grade.submission), f": {clean(on_one_line(grade.reason))}", _by_hand(grade))
+            for grade in failed
         )
         if len(failed) > 8:  # fold a long list
             blocks.append(Details(WORDS.spans("many_failed", n=str(len(failed))), (reasons,)))
@@ -129,18 +129,39 @@ def _to_look_at(
     return blocks
 
 
-def not_final(lines: Sequence[GradeSummary]) -> str:
+def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:
+    """Return a question for the instructor if recordings need springs missing from the rubric.
+
+    Returns "" if there is nothing to ask.
+
+    Parameters
+    ----------
+    graded : for each graded submission, the springs missing from the rubric.
+    """
+    every = list(graded)
+    asking = [springs for springs in every if springs]
+    if not asking:
+        return ""
+    names = ", ".join(dict.fromkeys(name for springs in asking for name in springs))
+    return (
+        f"the recordings of {len(asking)} of {len(every)} submissions need springs that the "
+        f"rubric lacks ({names}), and were judged with these springs: does the rubric's [system] "
+        "match the benches?"
+    )
+
+
+def not_final(grades: Sequence[Grade]) -> str:
     """Return how many submissions a person has yet to grade, and where; "" if all are final."""
-    waiting = Counter(id_ for line in lines for id_ in line.open)
+    waiting = Counter(id_ for grade in grades for id_ in grade.open)
     if not waiting:
         return ""
-    n = counted(sum(bool(line.open) for line in lines), "submission")
+    n = counted(sum(bool(grade.open) for grade in grades), "submission")
     named = listing([f"{id_} ({many})" for id_, many in waiting.items()])
     return WORDS.text("not_final", submissions=n, criteria=named)
 
 
-def _by_hand(line: GradeSummary) -> str:
-    return f" ({points_text(line.points)} points by hand)" if line.by_hand else ""
+def _by_hand(grade: Grade) -> str:
+    return f" ({points_text(grade.points)} points by hand)" if grade.by_hand else ""
 
 
 def _points(page: PageBuilder, points: "pd.Series", rubric: Rubric) -> list[Block]:
@@ -193,16 +214,16 @@ def _criteria(page: PageBuilder, graded: "pd.DataFrame", rubric: Rubric) -> list
     return [page.picture("difficulty", figure, WORDS, "difficulty", **told), table]
 
 
-def _mistakes(page: PageBuilder, lines: Sequence[GradeSummary]) -> list[Block]:
+def _mistakes(page: PageBuilder, grades: Sequence[Grade]) -> list[Block]:
     """Return the table of flags, the most common first."""
     import pandas as pd
 
     codes = pd.Series(
-        [line.codes for line in lines], [line.submission for line in lines], dtype=object
+        [grade.codes for grade in grades], [grade.submission for grade in grades], dtype=object
     )
     having = codes.explode().dropna()
     if having.empty:
-        return [paragraph(WORDS.text("no_remarks"))] if lines else []
+        return [paragraph(WORDS.text("no_remarks"))] if grades else []
     counts = having.value_counts().to_dict()
     order: list[Code] = sorted(counts, key=lambda code: (-counts[code], CODES.index(code)))
     rows = []
@@ -212,20 +233,18 @@ def _mistakes(page: PageBuilder, lines: Sequence[GradeSummary]) -> list[Block]:
             [
                 spans(f"{WORDS.text(f'title_{code}')} (", Span(code, "code"), ")"),
                 str(counts[code]),
-                f"{100 * counts[code] / len(lines):.0f} %",
+                f"{100 * counts[code] / len(grades):.0f} %",
                 spans(*_listed(named)),
             ]
         )
     return [page.table(WORDS, "class_remarks", rows, "lrrl")]
 
 
-def _shared(
-    page: PageBuilder, lines: Sequence[GradeSummary], clusters: Sequence[Cluster]
-) -> list[Block]:
+def _shared(page: PageBuilder, grades: Sequence[Grade], clusters: Sequence[Cluster]) -> list[Block]:
     """Return the table of what is shared, grouped by clusters of submissions."""
     if not clusters:
         return []
-    here = {line.submission for line in lines}
+    here = {grade.submission for grade in grades}
     rows = []
     for number, cluster in enumerate(clusters, start=1):
         for submissions, recordings in cluster.by_submissions().items():
@@ -242,34 +261,34 @@ def _listed(links: Sequence[Span]) -> list[str | Span]:
     return [*text, f" and {more} more"] if more > 0 else text
 
 
-def _everybody(page: PageBuilder, lines: Sequence[GradeSummary]) -> list[Block]:
-    if not lines:
+def _everybody(page: PageBuilder, grades: Sequence[Grade]) -> list[Block]:
+    if not grades:
         return []
-    table = page.table(WORDS, "everybody", map(_row, lines), "llrrrll")
+    table = page.table(WORDS, "everybody", map(_row, grades), "llrrrll")
     return [replace(table, finder=True)]
 
 
-def _row(line: GradeSummary) -> list[Cell | str | Spans]:
-    failed = line.status == "failed"
-    share = 100 * exact(line.points) / exact(line.out_of) if line.out_of else 0
+def _row(grade: Grade) -> list[Cell | str | Spans]:
+    failed = grade.status == "failed"
+    share = 100 * exact(grade.points) / exact(grade.out_of) if grade.out_of else 0
     return [
-        (_link(line.submission),),
-        clean(listing(line.authors)) or NOTHING,
-        points_text(line.points),
+        (_link(grade.submission),),
+        clean(listing(grade.authors)) or NOTHING,
+        points_text(grade.points),
         f"{math.floor(share)}",  # rounded down, so that only full points give 100
-        f"{line.days_late:.3g}" if line.days_late else "0",
-        cell("not graded yet" if line.unsettled else "not graded", "bad")
+        f"{grade.days_late:.3g}" if grade.days_late else "0",
+        cell("not graded yet" if grade.unsettled else "not graded", "bad")
         if failed
-        else ", ".join(line.codes),
-        _hand_text(line),
+        else ", ".join(grade.codes),
+        _hand_text(grade),
     ]
 
 
-def _hand_text(line: GradeSummary) -> str:
+def _hand_text(grade: Grade) -> str:
     """Return what a person has changed, and what a person still has to grade."""
-    given = [own.criterion for own in line.overrides]
-    given += [f"total {signed_points(one.points)} ({clean(one.why)})" for one in line.adjustments]
-    given += [f"{id_}: open" for id_ in line.open]
+    given = [own.criterion for own in grade.overrides]
+    given += [f"total {signed_points(one.points)} ({clean(one.why)})" for one in grade.adjustments]
+    given += [f"{id_}: open" for id_ in grade.open]
     return ", ".join(given)
 
 

@@ -10,8 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import ConfigError
-from pipeline.grading.grade import Flag, grade_text
-from pipeline.grading.gradebook.class_lines import GradeSummary
+from pipeline.grading.grade import Flag, Grade, grade_text
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import feedback_page
@@ -55,7 +54,7 @@ def write_outputs(
     folder.mkdir(parents=True, exist_ok=True)
     made_of = _read_made(folder)
     layout = _digest_layout(rubric)
-    lines: list[GradeSummary] = []
+    grades: list[Grade] = []
     now_of: dict[str, str] = {}
     gradings: dict[str, int] = {}
     authors: dict[str, tuple[str, ...]] = {}
@@ -67,7 +66,7 @@ def write_outputs(
         )
         seen = view(entry, "staff", names=names)
         grade = seen.grade
-        lines.append(GradeSummary.of(grade))
+        grades.append(grade)
         numbers[grade.submission] = recomputed_numbers(grade, rubric=rubric)
         gradings[entry.submission], authors[entry.submission] = entry.grading, entry.grade.authors
         now_of[grade.submission] = _digest(layout, entry.key, repr(grade))
@@ -87,19 +86,19 @@ def write_outputs(
         write_file(own / _JSON, grade_text(grade))
     if names is not None:
         # The order of the class list would reveal the names.
-        lines.sort(key=lambda line: line.submission)
+        grades.sort(key=lambda grade: grade.submission)
     _remove_stale(folder, keep=set(now_of))
-    write_file(out / "grades.csv", grades_csv(lines, rubric=rubric))
+    write_file(out / "grades.csv", grades_csv(grades, rubric=rubric))
     repeated = repeated_authors_of(book, authors, gradings=gradings, names=names)
     clusters = find_clusters(shared)
     if names is not None:
         clusters = renamed(clusters, names, other=STRANGER)
     distant = find_distant(numbers)
-    whole = lines, repeated, clusters, distant
+    whole = repeated, clusters, distant
     now_of[_WHOLE] = _digest(layout, repr(whole), *now_of.values())
     if made_of.get(_WHOLE) != now_of[_WHOLE] or not (out / _CLASS).is_file():
         page = class_page(
-            lines, rubric=rubric, repeated_authors=repeated, clusters=clusters, distant=distant
+            grades, rubric=rubric, repeated_authors=repeated, clusters=clusters, distant=distant
         )
         write_file(out / _CLASS, page)
     write_file(
@@ -140,28 +139,28 @@ def repeated_authors_of(
     )
 
 
-def grades_csv(lines: Sequence[GradeSummary], *, rubric: Rubric) -> str:
+def grades_csv(grades: Sequence[Grade], *, rubric: Rubric) -> str:
     """Return `grades.csv`: one row per submission, one column per criterion."""
     taken = {*_BEFORE, *_AFTER}
     ids = [criterion.id for criterion in rubric.criteria]
     heads = [f"criterion {id_}" if id_ in taken else id_ for id_ in ids]
     rows = [
         (
-            line.submission,
-            " ".join(line.authors),
-            line.status,
-            line.points,
-            line.out_of,
-            line.days_late,
-            line.deducted,
-            *(line.judged[id_]["points"] if id_ in line.judged else "" for id_ in ids),
-            " ".join(line.codes),
-            " ".join(line.by_hand),
-            on_one_line(line.reason),
-            sum(one.points for one in line.adjustments),
-            " ".join(line.open),
+            grade.submission,
+            " ".join(grade.authors),
+            grade.status,
+            grade.points,
+            grade.out_of,
+            grade.days_late,
+            grade.deducted,
+            *(grade.judged[id_].points if id_ in grade.judged else "" for id_ in ids),
+            " ".join(grade.codes),
+            " ".join(grade.by_hand),
+            on_one_line(grade.reason),
+            sum(one.points for one in grade.adjustments),
+            " ".join(grade.open),
         )
-        for line in lines
+        for grade in grades
     ]
     return csv_text((*_BEFORE, *heads, *_AFTER), rows)
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from pipeline.grading.grade import Code, Criterion, Flag, Grade
-from pipeline.grading.gradebook.class_lines import GradeSummary
 from pipeline.grading.gradebook.entry import Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import FAILED, Event
@@ -49,7 +48,7 @@ class GradeView:
     @property
     def is_by_hand(self) -> bool:
         """Whether a person gave points or changed the total."""
-        return bool(self.grade.overrides or self.grade.adjustments)
+        return bool(self.grade.by_hand)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -163,23 +162,16 @@ def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
     submission could not be graded. In the reason they precede file names, because platforms put the
     student's name into the name of an archive. Names that students gave to runs and files stay.
     """
-    hidden = _hidden_names(grade, names) | {
+    own = names[grade.submission]
+    hidden = {
+        "submission": own,
+        "authors": (),
+        "reason": hidden_reason(grade.reason, grade.submission, own),
         "flags": tuple(
             _hidden(flag, names) if flag.code == "shared_data" else flag for flag in grade.flags
         ),
     }
     return grade.model_copy(update=hidden)
-
-
-def anonymous_line(line: GradeSummary, names: Mapping[str, str]) -> GradeSummary:
-    """Return the line of a submission under its pseudonym, without authors."""
-    return line.model_copy(update=_hidden_names(line, names))
-
-
-def _hidden_names(grade: Grade | GradeSummary, names: Mapping[str, str]) -> dict[str, object]:
-    own = names[grade.submission]
-    reason = hidden_reason(grade.reason, grade.submission, own)
-    return {"submission": own, "authors": (), "reason": reason}
 
 
 def hidden_reason(reason: str, submission: str, own: str) -> str:

@@ -9,7 +9,6 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion, Grade, read_grade
-from pipeline.grading.gradebook.class_lines import GradeSummary
 from pipeline.grading.gradebook.decisions import Conflict, points_lost, read_wishes
 from pipeline.grading.gradebook.entry import TOTAL
 from pipeline.grading.gradebook.history import history_text
@@ -109,7 +108,7 @@ def test_an_open_criterion_has_no_points_yet(tmp_path):
     rubric = with_manual(two_cart_rubric())
     class_ = [with_open(make_grade(name)) for name in ("a", "b", "c")]
     with book_of(tmp_path, *class_, rubric=rubric) as book:
-        page = class_page([GradeSummary.of(one.grade) for one in book.entries()], rubric=rubric)
+        page = class_page([one.grade for one in book.entries()], rubric=rubric)
         assert "lowest: discussion" not in page
         book.override("a", "discussion", 3, why="damping", by="Ada")
         book.override("b", "discussion", 0, why="none handed in", by="Ada")
@@ -134,7 +133,7 @@ def test_adjustments_add_up_and_survive_regrading(book):
     book.adjust("team-1", -100, why="copied", by="Bob")
     finish(book, make_grade("team-1", share=0.5), key="second")
     entry = book.entry("team-1")
-    assert (entry.grade.points, book.class_now().rows[0].line.points) == (0, 0)
+    assert (entry.grade.points, book.class_now().entries[0].grade.points) == (0, 0)
     adjusted = [(a.points, a.why) for a in entry.grade.adjustments]
     assert adjusted == [(1.5, "plot"), (-100, "copied")]
     events = [(e.points, e.by) for e in book.history("team-1")[1] if e.what == "adjusted"]

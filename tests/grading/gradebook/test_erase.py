@@ -123,7 +123,7 @@ def test_a_number_of_an_erased_grading_is_not_used_again(tmp_path):
         again = make_grade("zoe", share=0.2, authors=("mallory",))
         finish(book, make_grade("alice"), make_outcome(again, key="other"))
         shown = desk.of(tmp_path).teams["zoe"]
-        assert (shown.line.points, shown.line.authors) == (again.points, ("mallory",))
+        assert (shown.grade.points, shown.grade.authors) == (again.points, ("mallory",))
         assert shown.version != seen
         assert book.accept_all({"zoe": seen}, by="Ada").teams == 0
 

@@ -312,13 +312,13 @@ def test_the_history_gives_the_new_name_of_a_team(open_book):
 def test_teams_are_accepted_together_as_they_were_seen(book):
     """A team that got another event or another grading since it was listed is left out."""
     finish(book, *(make_grade(name, share=0.5) for name in ("team-1", "team-2", "team-3")))
-    seen = {row.submission: row.version for row in book.class_now().rows}
+    seen = {row.submission: row.whole_version for row in book.class_now().entries}
     book.override("team-1", "laws", 1.0, why="x", by="Bob")
     finish(book, make_grade("team-1", share=0.5), make_grade("team-2", share=0.5),
            make_outcome(make_grade("team-3"), key="again"))  # fmt: skip
     done = book.accept_all(seen, by="Ada")
     assert (done.teams, done.kept) == (1, ("team-1", "team-3"))
-    assert {row.submission: row.reviewed_by for row in book.class_now().rows} == {
+    assert {row.submission: row.reviewed_by for row in book.class_now().entries} == {
         "team-1": "", "team-2": "Ada", "team-3": ""}  # fmt: skip
     assert book.accept_all({"gone": "1.0"}, by="Ada").teams == 0
 
@@ -327,12 +327,12 @@ def test_a_team_whose_recordings_turn_out_to_be_shared_is_not_accepted(book):
     """A flag of the class list is part of what a person saw."""
     class_ = make_grade("team-1"), make_grade("team-2")
     finish(book, *class_)
-    seen = {row.submission: row.version for row in book.class_now().rows}
+    seen = {row.submission: row.whole_version for row in book.class_now().entries}
     finish(book, *class_, shared={"team-2": shared_flag("team-1")})
     done = book.accept_all(seen, by="Ada")
     assert (done.teams, done.kept) == (1, ("team-2",))
-    assert all(row.version == book.entry(row.submission).whole_version
-               for row in book.class_now().rows)  # fmt: skip
+    assert all(row.whole_version == book.entry(row.submission).whole_version
+               for row in book.class_now().entries)  # fmt: skip
 
 
 def test_rows_are_only_added(book, place):

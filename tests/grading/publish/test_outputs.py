@@ -17,7 +17,6 @@ from pipeline.errors import ConfigError
 from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import CODES, Adjustment, Flag, Grade
-from pipeline.grading.gradebook.class_lines import GradeSummary
 from pipeline.grading.gradebook.decisions import read_points
 from pipeline.grading.gradebook.entry import Event, with_overrides
 from pipeline.grading.gradescope import results_text
@@ -408,7 +407,7 @@ def test_only_full_points_are_100_percent(points, percent):
 
     So only full points are shown as 100 %.
     """
-    page = class_page([GradeSummary.of(make_grade("a", points=points))], rubric=RUBRIC)
+    page = class_page([make_grade("a", points=points)], rubric=RUBRIC)
     cells = re.sub(r"<[^>]+>", " ", page.split("All submissions.")[-1]).split()
     assert cells[cells.index(str(points)) + 1] == percent
 
@@ -417,8 +416,7 @@ def test_the_class_page_shows_statistics():
     """The class page shows mean and median, outcomes per criterion, and teams per mistake."""
     grades = [make_grade("a"), make_grade("b", share=0.5, flags=(hertz_flag(),)),
               make_grade("c", share=0.0, flags=(hertz_flag(), missing_flag()))]  # fmt: skip
-    lines = [GradeSummary.of(grade) for grade in grades]
-    lines.append(GradeSummary.of(failed_grade("d", "broken")))
+    lines = [*grades, failed_grade("d", "broken")]
     html = re.sub(r"<[^>]+>", " ", class_page(lines, rubric=RUBRIC))
     text = " ".join(html.split())
     assert re.search("graded 1 .*3 graded 10.00 of 20 .*3 graded 10.00 of 20", text)
@@ -505,7 +503,7 @@ def missing_flag() -> Flag:
 @pytest.mark.parametrize("grades", [[], [failed_grade("a", "broken")]])
 def test_a_class_without_grades_has_a_page(grades):
     """A class has a page even if nobody submitted or nothing could be graded."""
-    html = class_page([GradeSummary.of(grade) for grade in grades], rubric=RUBRIC)
+    html = class_page(grades, rubric=RUBRIC)
     assert "Submissions" in html
 
 
