@@ -24,8 +24,8 @@ import numpy as np
 from benchmarks.copies import disguised
 from benchmarks.grading_batch import grade, write_class
 from benchmarks.page import significant
-from pipeline.grading.batch.worker import grade_task
-from pipeline.grading.gradings import Member, Task
+from pipeline.grading.batch.worker import grade_hand_in
+from pipeline.grading.gradings import HandIn, Member
 from pipeline.grading.intake.files import packed
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.copies import find_copies
@@ -55,9 +55,9 @@ def measure(*, teams: int) -> dict[str, Any]:
             write_class(base / preset, teams, preset=preset)
             rubric, seconds = load_rubric(Path(preset)), []
             for number, team in enumerate(sorted((base / preset).iterdir())):
-                task = Task(id=team.name, key=team.name, sources=(str(team),))
+                task = HandIn(id=team.name, key=team.name, sources=(team,))
                 start = time.process_time()
-                grading = grade_task(task, rubric=rubric, scratch=base)
+                grading = grade_hand_in(task, rubric=rubric, scratch=base)
                 if number:  # the first task also loads code that all tasks use
                     seconds.append(round(time.process_time() - start, 3))
                 book = len(grading.grade) + len(grading.fingerprints)

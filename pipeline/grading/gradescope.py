@@ -26,7 +26,7 @@ import pipeline
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.runner import Grader
 from pipeline.grading.grade import Criterion, Grade, read_grade
-from pipeline.grading.gradings import Setup, Task
+from pipeline.grading.gradings import HandIn, Setup
 from pipeline.grading.publish.view import GradeView, new_view
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import find_rubric, load_rubric, parse_rubric, rubric_source
@@ -199,9 +199,9 @@ def grade_upload(root: Path) -> str:
         setup = Setup(rubric=rubric, scratch=Path(scratch), time_limit=_TIME_LIMIT)
         grader = Grader(setup)
         try:
-            # The task has no lateness: Gradescope knows the extensions and deducts points itself.
-            task = Task(id="submission", key="", sources=(str(root / "submission"),))
-            grading = grader.run(task)
+            # Without lateness: Gradescope knows the extensions and deducts points itself.
+            hand_in = HandIn(id="submission", sources=(root / "submission",))
+            grading = grader.run(hand_in)
         finally:
             grader.close()
     text = results_text(new_view(read_grade(grading.grade), rubric))

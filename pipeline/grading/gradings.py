@@ -1,4 +1,4 @@
-"""Types shared by the runner, its grading processes and the gradebook: tasks, gradings, batches.
+"""Types shared by the runner, its grading processes and the gradebook: hand-ins, gradings, batches.
 
 Importing this module loads no code that grades.
 """
@@ -13,6 +13,45 @@ from typing import Any, Literal
 
 from pipeline.grading.grade import Flag, Grade, grade_text
 from pipeline.grading.rubric import Rubric
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandIn:
+    """The files that one team submitted, to be graded.
+
+    Attributes
+    ----------
+    id : id that is unique in the batch and valid as a folder name.
+    sources : one folder, or several files, which may be archives.
+    owner : account that submitted the files, with platform and account number, such as "Jane Doe
+        (moodle 1024)"; see `platforms.Account`; or "".
+    handed_in : time of the hand-in in ISO 8601, or "" if the platform does not give it.
+    problem : why the files cannot be opened, if this is already known; or "".
+    parent : name of the parent folder, which may be used to make the id unique.
+    key : hash of everything that affects the outcome; see `Member`.
+    digest : expected hash of the submitted files; "" to skip this check.
+    repairs : see `intake.repairs.read_repairs`.
+    """
+
+    id: str
+    sources: tuple[Path, ...] = ()
+    owner: str = ""
+    handed_in: str = ""
+    days_late: float = 0.0
+    problem: str = ""
+    parent: str = ""
+    key: str = ""
+    digest: str = ""
+    repairs: Mapping[str, Mapping[str, str]] = field(default_factory=dict, hash=False)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the hand-in as a dictionary that JSON can store."""
+        return asdict(self) | {"sources": [str(source) for source in self.sources]}
+
+    @classmethod
+    def read(cls, plain: Mapping[str, Any]) -> "HandIn":
+        """Return the hand-in that `plain` turned into a dictionary."""
+        return cls(**{**plain, "sources": tuple(map(Path, plain["sources"]))})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,29 +201,8 @@ class Setup:
     out: Path | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """One submission to grade.
-
-    Attributes
-    ----------
-    id, owner, days_late : as in `intake.find.HandIn`.
-    key : hash of everything that affects the outcome; see `gradings.Member`.
-    digest : expected hash of the submitted files; "" to skip this check.
-    repairs : see `intake.repairs.read_repairs`.
-    """
-
-    id: str
-    key: str
-    sources: tuple[str, ...]
-    digest: str = ""
-    owner: str = ""
-    days_late: float = 0.0
-    repairs: Mapping[str, Mapping[str, str]] = field(default_factory=dict, hash=False)
-
-
 def failed(
-    task: Task,
+    hand_in: HandIn,
     reason: str,
     *,
     out_of: float,
@@ -205,23 +223,23 @@ def failed(
     reason = "".join(c if c.isprintable() or c == "\n" else "�" for c in "\n".join(lines))
     people = tuple(authors)
     grade = Grade.failed(
-        task.id,
+        hand_in.id,
         reason,
         out_of=out_of,
         authors=people,
-        days_late=task.days_late,
+        days_late=hand_in.days_late,
         unsettled=not settled,
     ).model_copy(update={"repaired": repaired})
     return Grading(
-        submission=task.id,
+        submission=hand_in.id,
         authors=people,
-        key=task.key,
+        key=hand_in.key,
         status="failed",
         reason=reason,
         settled=settled,
-        days_late=task.days_late,
+        days_late=hand_in.days_late,
         grade=grade_text(grade),
-        owner=task.owner,
+        owner=hand_in.owner,
         detail=detail,
     )
 

@@ -15,7 +15,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.batch.runner import find_class_changes
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Grading, Setup, Task
+from pipeline.grading.gradings import Grading, HandIn, Setup
 from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.resources import RUBRICS
@@ -45,7 +45,7 @@ def school(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def known() -> dict[Task, Grading]:
+def known() -> dict[HandIn, Grading]:
     """Return the grades so far, for tests that grade the same files again."""
     return {}
 
@@ -54,7 +54,7 @@ def known() -> dict[Task, Grading]:
 def _here(monkeypatch, known):
     """Grade in this process, and each task only once; a separate worker would give the same."""
 
-    def execute(tasks: Sequence[Task], setup: Setup) -> Iterator[Grading]:
+    def execute(tasks: Sequence[HandIn], setup: Setup) -> Iterator[Grading]:
         for task in tasks:
             once = replace(task, sources=())  # the key depends on the submitted files
             if once not in known:

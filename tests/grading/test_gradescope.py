@@ -19,10 +19,10 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading import gradescope
 from pipeline.grading.batch.runner import Grader
-from pipeline.grading.batch.worker import grade_task
+from pipeline.grading.batch.worker import grade_hand_in
 from pipeline.grading.grade import Grade, read_grade
 from pipeline.grading.gradescope import pin_requirements, write_autograder
-from pipeline.grading.gradings import Grading, Task
+from pipeline.grading.gradings import Grading, HandIn
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
 from tests.helpers.commandline import cartlab_here
@@ -105,7 +105,7 @@ def upload(root: Path, submission: Path) -> dict[str, Any]:
 def upload_here(root: Path, submission: Path, *, rubric: str = "") -> dict[str, Any]:
     """Grade the upload in this process, because starting a new process takes a second."""
 
-    def grade(grader: Grader, task: Task) -> Grading:
+    def grade(grader: Grader, task: HandIn) -> Grading:
         return next(in_this_process([task], grader._setup))
 
     put(root, submission, rubric=rubric)
@@ -149,8 +149,8 @@ def read_results(root: Path) -> dict[str, Any]:
 
 def grade_here(submission: Path, scratch: Path) -> Grade:
     """Return the grade that `cartlab grade` gives."""
-    task = Task(id="team", key="", sources=(str(submission),))
-    return read_grade(grade_task(task, rubric=load_rubric(RUBRIC), scratch=scratch).grade)
+    task = HandIn(id="team", key="", sources=(submission,))
+    return read_grade(grade_hand_in(task, rubric=load_rubric(RUBRIC), scratch=scratch).grade)
 
 
 @pytest.mark.slow

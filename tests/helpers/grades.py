@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.grading.batch.worker import grade_task
+from pipeline.grading.batch.worker import grade_hand_in
 from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
 from pipeline.grading.gradebook.database import FILE
 from pipeline.grading.gradebook.entry import Entry, Request
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Batch, Grading, Setup, Task
+from pipeline.grading.gradings import Batch, Grading, HandIn, Setup
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
@@ -33,11 +33,11 @@ def two_cart_rubric() -> Rubric:
     return load_rubric(RUBRICS / "throne-2dof.toml")
 
 
-def in_this_process(tasks: Sequence[Task], setup: Setup) -> Iterator[Grading]:
+def in_this_process(tasks: Sequence[HandIn], setup: Setup) -> Iterator[Grading]:
     """Run tasks without a worker process, whose start takes longer than grading a small class."""
     how = {"rubric": setup.rubric, "scratch": setup.scratch, "figures": setup.figures}
     for task in tasks:
-        yield grade_task(task, **how)
+        yield grade_hand_in(task, **how)
 
 
 def make_grade(name: str, *, share: float = 1.0, days_late: float = 0.0, **changes: Any) -> Grade:

@@ -1,4 +1,4 @@
-"""Run grading tasks on a Dask cluster; each task carries the submitted files.
+"""Grade hand-ins on a Dask cluster; each task carries the submitted files.
 
 Each Dask worker starts separate grading processes (`runner.Grader`). A submission that crashes or
 hangs ends only its grading process, not the Dask worker.
@@ -17,7 +17,7 @@ from distributed.worker import Worker as DaskWorker
 
 from pipeline.errors import ConfigError, is_disk_full
 from pipeline.grading.batch.runner import Executor, Grader, code_version
-from pipeline.grading.gradings import Grading, Setup, Task, failed
+from pipeline.grading.gradings import Grading, HandIn, Setup, failed
 from pipeline.grading.intake.files import packed, unpacked
 
 _CONNECT_LIMIT = 20  # s
@@ -26,7 +26,7 @@ _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
 def run_on(address: str) -> Executor:
-    """Return a function that runs grading tasks on a Dask cluster.
+    """Return a function that grades hand-ins on a Dask cluster.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def run_on(address: str) -> Executor:
             f"{address}: no certificates in Dask's configuration (distributed.comm.tls)"
         )
 
-    def execute(tasks: Sequence[Task], setup: Setup) -> Iterator[Grading]:
+    def execute(hand_ins: Sequence[HandIn], setup: Setup) -> Iterator[Grading]:
         try:
             client = Client(address, timeout=_CONNECT_LIMIT, set_as_default=False)
         except (OSError, TimeoutError) as error:
@@ -65,7 +65,7 @@ def run_on(address: str) -> Executor:
             graders = f"cartlab-graders-{uuid4()}"
             client.register_plugin(Graders(setup), name=graders)
             try:
-                yield from _grade_all(client, tasks, graders=graders, out_of=setup.rubric.out_of)
+                yield from _grade_all(client, hand_ins, graders=graders, out_of=setup.rubric.out_of)
             finally:
                 client.unregister_worker_plugin(graders)
 
@@ -80,7 +80,7 @@ class Graders(WorkerPlugin):
         self._code = code_version()
 
     def setup(self, worker: DaskWorker) -> None:
-        """Make a folder for submissions; grading processes start later, when tasks need them."""
+        """Make a folder for submissions; grading processes start later, when hand-ins need them."""
         self._folder = tempfile.TemporaryDirectory(prefix="cartlab-", ignore_cleanup_errors=True)
         self._idle: SimpleQueue[Grader] = SimpleQueue()
         self._all: list[Grader] = []
@@ -92,7 +92,7 @@ class Graders(WorkerPlugin):
             process.close()
         self._folder.cleanup()
 
-    def grade(self, task: Task, archive: bytes) -> Grading:
+    def grade(self, hand_in: HandIn, archive: bytes) -> Grading:
         """Write the submission to disk and grade it in a separate process."""
         try:
             process = self._idle.get_nowait()
@@ -104,18 +104,18 @@ class Graders(WorkerPlugin):
                 dir=self._folder.name, ignore_cleanup_errors=True
             ) as folder:
                 unpacked(archive, Path(folder))
-                return process.run(replace(task, sources=(folder,)))
+                return process.run(replace(hand_in, sources=(Path(folder),)))
         finally:
             self._idle.put(process)
 
 
-def _grade_on_worker(task: Task, archive: bytes, plugin: str) -> Grading:
-    """Grade a task on a Dask worker, with the plugin `Graders` of that worker."""
+def _grade_on_worker(hand_in: HandIn, archive: bytes, plugin: str) -> Grading:
+    """Grade a hand-in on a Dask worker, with the plugin `Graders` of that worker."""
     graders = get_worker().plugins[plugin]
     assert isinstance(graders, Graders)
     if not graders.same_code:
         raise ConfigError("the cluster's workers run another version of cartlab, numpy or scipy")
-    return graders.grade(task, archive)
+    return graders.grade(hand_in, archive)
 
 
 def _threads(client: Client) -> int:
@@ -125,38 +125,38 @@ def _threads(client: Client) -> int:
 
 
 def _grade_all(
-    client: Client, tasks: Sequence[Task], *, graders: str, out_of: float
+    client: Client, hand_ins: Sequence[HandIn], *, graders: str, out_of: float
 ) -> Iterator[Grading]:
     """Yield each outcome when it is ready.
 
     If a worker is lost, Dask runs its tasks again on another worker.
     """
-    waiting = list(reversed(tasks))
-    under_way: dict[str, Task] = {}
+    waiting = list(reversed(hand_ins))
+    under_way: dict[str, HandIn] = {}
     answers = as_completed(loop=client.loop)
     while waiting or under_way:
         room = max(1, _AHEAD * _threads(client))
         while waiting and len(under_way) < room:
-            task = waiting.pop()
+            hand_in = waiting.pop()
             try:
-                archive = packed([Path(source) for source in task.sources])
+                archive = packed(hand_in.sources)
             except OSError as error:
                 reason = f"cannot be read ({error.strerror or error}); the next run tries again"
-                yield failed(task, reason, out_of=out_of, settled=False)
+                yield failed(hand_in, reason, out_of=out_of, settled=False)
                 continue
-            key = f"{graders}-{task.key}"
-            future = client.submit(_grade_on_worker, task, archive, graders, key=key, pure=False)
-            under_way[str(future.key)] = task
+            key = f"{graders}-{hand_in.key}"
+            future = client.submit(_grade_on_worker, hand_in, archive, graders, key=key, pure=False)
+            under_way[str(future.key)] = hand_in
             answers.add(future)
         if not under_way:
             continue
         future = next(answers)
-        task = under_way.pop(str(future.key))
+        hand_in = under_way.pop(str(future.key))
         if future.status == "finished":
             yield future.result()
         elif isinstance(error := future.exception(), ConfigError):
             raise error
         else:
             reason = f"the cluster could not grade it: {error}"
-            outcome = failed(task, reason, out_of=out_of, settled=False)
+            outcome = failed(hand_in, reason, out_of=out_of, settled=False)
             yield replace(outcome, is_disk_full=isinstance(error, OSError) and is_disk_full(error))

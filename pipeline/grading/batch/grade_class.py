@@ -14,8 +14,8 @@ from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.batch.runner import Executor, Progress, grade_batch, run_here, silent
 from pipeline.grading.gradebook.database import Lost
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Batch, Example, Setup
-from pipeline.grading.intake.find import HandIn, find_hand_ins, read_late_table, settle_lateness
+from pipeline.grading.gradings import Batch, Example, HandIn, Setup
+from pipeline.grading.intake.find import find_hand_ins, read_late_table, settle_lateness
 from pipeline.grading.intake.repairs import Run, save_run
 from pipeline.grading.publish.class_page import wrong_springs
 from pipeline.grading.publish.outputs import write_outputs

@@ -5,7 +5,7 @@ import json
 import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,14 +18,13 @@ from pipeline.grading.gradings import (
     Batch,
     Example,
     Grading,
+    HandIn,
     Member,
     Setup,
-    Task,
     failed,
     read_grading,
 )
 from pipeline.grading.intake.files import digest
-from pipeline.grading.intake.find import HandIn
 from pipeline.grading.intake.repairs import FOLDER, Repair, keep_original, read_repairs
 from pipeline.grading.platforms import Account, same_number
 from pipeline.grading.rubric import Rubric
@@ -36,7 +35,7 @@ from pipeline.processes import Ended, Failed, Supervisor
 from pipeline.resources import TEMPLATES
 
 Progress = Callable[[int, int, str], None]
-Executor = Callable[[Sequence[Task], Setup], Iterator[Grading]]
+Executor = Callable[[Sequence[HandIn], Setup], Iterator[Grading]]
 
 _AUTHORS_LIMIT = 60.0  # s to read the authors of a submission whose grading was stopped
 
@@ -63,7 +62,7 @@ def grade_batch(
 
     Parameters
     ----------
-    execute : function that runs the tasks: `run_here(jobs=…)` or `cluster.run_on(address)`.
+    execute : function that grades the hand-ins: `run_here(jobs=…)` or `cluster.run_on(address)`.
     examples : function that returns the examples handed out with the assignment; it is called only
         if submissions share something.
     progress : function that is called with the number of submissions done, the total, and the last
@@ -101,38 +100,38 @@ def grade_batch(
 
 def _known_and_new(
     hand_ins: Sequence[HandIn], *, setup: Setup, book: Gradebook
-) -> tuple[dict[str, Member], list[Task]]:
-    """Return the known outcomes by submission, and the tasks that must run.
+) -> tuple[dict[str, Member], list[HandIn]]:
+    """Return the known outcomes by submission, and the hand-ins that must be graded.
 
     A hand-in that cannot be opened is stored as failed and counts as known.
     """
     basis = code_version(), setup.rubric.model_dump_json(), setup.figures
     rows, new = {}, []
-    for hand_in in hand_ins:
-        repairs = read_repairs(setup.out, hand_in.id) if setup.out else {}
-        task = _task(hand_in, basis=basis, repairs=repairs)
-        outcome = book.known(task.key, figures=False)
+    for submitted in hand_ins:
+        repairs = read_repairs(setup.out, submitted.id) if setup.out else {}
+        hand_in = _with_key(submitted, basis=basis, repairs=repairs)
+        outcome = book.known(hand_in.key, figures=False)
         if outcome is None and hand_in.problem:
-            outcome = failed(task, hand_in.problem, out_of=setup.rubric.out_of)
+            outcome = failed(hand_in, hand_in.problem, out_of=setup.rubric.out_of)
             book.put(outcome)
         if outcome is None or not outcome.settled:
-            new.append(task)
+            new.append(hand_in)
         else:
-            rows[task.id] = outcome.member
+            rows[hand_in.id] = outcome.member
     return rows, new
 
 
 def run_here(*, jobs: int) -> Executor:
-    """Return a function that runs tasks in `jobs` worker processes on this machine."""
+    """Return a function that grades hand-ins in `jobs` worker processes on this machine."""
 
-    def execute(tasks: Sequence[Task], setup: Setup) -> Iterator[Grading]:
-        waiting: queue.SimpleQueue[Task] = queue.SimpleQueue()
-        for task in tasks:
-            waiting.put(task)
+    def execute(hand_ins: Sequence[HandIn], setup: Setup) -> Iterator[Grading]:
+        waiting: queue.SimpleQueue[HandIn] = queue.SimpleQueue()
+        for hand_in in hand_ins:
+            waiting.put(hand_in)
         # With a short queue, workers wait until outcomes are stored, and memory use stays flat.
         answers: queue.Queue[Grading | Exception] = queue.Queue(maxsize=jobs)
         stop = threading.Event()
-        graders = [Grader(setup) for _ in range(min(jobs, len(tasks)))]
+        graders = [Grader(setup) for _ in range(min(jobs, len(hand_ins)))]
         threads = [
             threading.Thread(target=_work, args=(grader, waiting, answers, stop), daemon=True)
             for grader in graders
@@ -140,7 +139,7 @@ def run_here(*, jobs: int) -> Executor:
         for thread in threads:
             thread.start()
         try:
-            for _ in tasks:
+            for _ in hand_ins:
                 answer = answers.get()
                 if isinstance(answer, Exception):
                     raise answer
@@ -166,8 +165,8 @@ class Grader:
         module = "pipeline.grading.batch.worker"
         self._process = Supervisor(module, memory=setup.memory_limit, setup=given)
 
-    def run(self, task: Task, *, stop: threading.Event | None = None) -> Grading:
-        """Run a task and return its outcome.
+    def run(self, hand_in: HandIn, *, stop: threading.Event | None = None) -> Grading:
+        """Grade a hand-in and return its outcome.
 
         Raises
         ------
@@ -176,7 +175,7 @@ class Grader:
         too_large = f"needed more than {self._setup.memory_limit / 1e9:g} GB of memory"
         try:
             plain = self._process.do(
-                ("grade", asdict(task)), limit=self._setup.time_limit, stop=stop
+                ("grade", hand_in.plain()), limit=self._setup.time_limit, stop=stop
             )
         except Ended as end:
             if end.how == "start":
@@ -184,38 +183,38 @@ class Grader:
                 raise ConfigError(f"the grading processes do not start: {last[-1]}") from None
             reasons = {"memory": too_large, "crash": f"the grader crashed ({end.status})"}
             return self._failed(
-                task,
+                hand_in,
                 reasons.get(end.how, str(end)),
-                authors=() if end.how == "stopped" else self._authors(task, stop),
+                authors=() if end.how == "stopped" else self._authors(hand_in, stop),
                 detail=end.stderr_end,
             )
         except Failed as error:
             self.close()  # after a failure, a new process is safer
-            return self._failed(task, str(error), authors=self._authors(task, stop))
+            return self._failed(hand_in, str(error), authors=self._authors(hand_in, stop))
         outcome = read_grading(plain)
         if not outcome.settled:
             self.close()
         if outcome.reason == OUT_OF_MEMORY:
-            return self._failed(task, too_large, authors=outcome.authors)
+            return self._failed(hand_in, too_large, authors=outcome.authors)
         return outcome
 
     def close(self) -> None:
-        """End the process; the next task starts a new one."""
+        """End the process; the next hand-in starts a new one."""
         self._process.close()
 
-    def _authors(self, task: Task, stop: threading.Event | None) -> Sequence[str]:
+    def _authors(self, hand_in: HandIn, stop: threading.Event | None) -> Sequence[str]:
         """Return the authors of a submission whose grading was stopped; () if it hides them."""
         try:
-            plain = self._process.do(("authors", asdict(task)), limit=_AUTHORS_LIMIT, stop=stop)
+            plain = self._process.do(("authors", hand_in.plain()), limit=_AUTHORS_LIMIT, stop=stop)
         except Failed:
             return ()
         return tuple(plain)
 
     def _failed(
-        self, task: Task, reason: str, *, authors: Sequence[str] = (), detail: str = ""
+        self, hand_in: HandIn, reason: str, *, authors: Sequence[str] = (), detail: str = ""
     ) -> Grading:
         return failed(
-            task,
+            hand_in,
             reason,
             authors=authors,
             out_of=self._setup.rubric.out_of,
@@ -226,17 +225,17 @@ class Grader:
 
 def _work(
     grader: Grader,
-    waiting: "queue.SimpleQueue[Task]",
+    waiting: "queue.SimpleQueue[HandIn]",
     answers: "queue.Queue[Grading | Exception]",
     stop: threading.Event,
 ) -> None:
     while not stop.is_set():
         try:
-            task = waiting.get_nowait()
+            hand_in = waiting.get_nowait()
         except queue.Empty:
             return grader.close()
         try:
-            answers.put(grader.run(task, stop=stop))
+            answers.put(grader.run(hand_in, stop=stop))
         except Exception as error:  # raised again in the thread that collects the outcomes
             answers.put(error)
             return
@@ -256,26 +255,16 @@ def code_version() -> str:
     return total.hexdigest()
 
 
-def _task(hand_in: HandIn, *, basis: tuple[str, str, bool], repairs: Mapping[str, Repair]) -> Task:
-    """Return the task that grades a hand-in.
-
-    The task's key is a hash of everything that affects the outcome.
-    """
+def _with_key(
+    hand_in: HandIn, *, basis: tuple[str, str, bool], repairs: Mapping[str, Repair]
+) -> HandIn:
+    """Return a hand-in with its repairs, and with the hash of all that affects the outcome."""
     files = digest(hand_in.sources)
-    plain = asdict(hand_in) | {"sources": files}
     repaired = {key: asdict(repair) for key, repair in repairs.items()}
-    plain |= {"repairs": repaired} if repaired else {}
-    everything = json.dumps([*basis, plain], sort_keys=True)
+    ready = replace(hand_in, digest=files, repairs=repaired)
+    everything = json.dumps([*basis, asdict(ready) | {"sources": files}], sort_keys=True)
     whole = hashlib.sha256(everything.encode("utf-8", "surrogateescape")).hexdigest()
-    return Task(
-        id=hand_in.id,
-        key=f"{whole}-{files}",
-        sources=tuple(str(source) for source in hand_in.sources),
-        digest=files,
-        owner=hand_in.owner,
-        days_late=hand_in.days_late,
-        repairs=repaired,
-    )
+    return replace(ready, key=f"{whole}-{files}")
 
 
 def _shared(

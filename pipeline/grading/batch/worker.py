@@ -11,7 +11,7 @@ from typing import Any
 
 from pipeline.errors import PipelineError, is_disk_full
 from pipeline.grading.grade import grade_text
-from pipeline.grading.gradings import OUT_OF_MEMORY, Grading, Task, failed, plain_grading
+from pipeline.grading.gradings import OUT_OF_MEMORY, Grading, HandIn, failed, plain_grading
 from pipeline.grading.intake.files import Changed, open_submission
 from pipeline.grading.intake.repairs import Repair, text_key
 from pipeline.grading.judge.award import findings_text
@@ -30,7 +30,9 @@ _TABLE = re.compile(r"\s*\[+\s*([\w.-]+)")
 _ID = re.compile(r"""\s*id\s*=\s*["'“”„]?([^"'“”#]+)""")
 
 
-def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = False) -> Grading:
+def grade_hand_in(
+    hand_in: HandIn, *, rubric: Rubric, scratch: Path, figures: bool = False
+) -> Grading:
     """Open, analyse and grade one submission; if it fails, the outcome holds the reason."""
     authors: tuple[str, ...] = ()
     reason = detail = original = by = ""
@@ -39,17 +41,16 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
         with tempfile.TemporaryDirectory(
             dir=scratch, prefix="open-", ignore_cleanup_errors=True
         ) as folder:
-            sources = [Path(source) for source in task.sources]
-            opened = open_submission(sources, Path(folder) / task.id, digest=task.digest)
+            opened = _open(hand_in, Path(folder))
             original = _handed_in(opened)
-            repaired = _repair(opened, task, original)
+            repaired = _repair(opened, hand_in, original)
             by = f"by {repaired.by}: {repaired.why}" if repaired else ""
             authors = named_authors(opened)
             submission = load_submission(opened)
             original = original if submission.unread or repaired else ""
             authors = tuple(author.id for author in submission.authors)
             graded = grade_submission(
-                submission, rubric=rubric, name=task.id, days_late=task.days_late
+                submission, rubric=rubric, name=hand_in.id, days_late=hand_in.days_late
             )
             grade = graded.grade
             notes = [*grade.notes, *asked_note(opened)]
@@ -59,17 +60,17 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
             records = graded.analysis.records if graded.analysis else ()
             drawn, detail = _figures(submission, graded, rubric) if figures else ((), "")
             return Grading(
-                submission=task.id,
+                submission=hand_in.id,
                 authors=grade.authors,
-                key=task.key,
+                key=hand_in.key,
                 status=grade.status,
                 reason=grade.reason,
-                days_late=task.days_late,
+                days_late=hand_in.days_late,
                 grade=grade_text(grade),
                 findings=findings_text(graded.judgements) if graded.judgements else "",
                 fingerprints=fingerprint(records),
                 figures=drawn,
-                owner=task.owner,
+                owner=hand_in.owner,
                 settled=not detail,
                 detail=detail,
                 original=original,
@@ -87,7 +88,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
         reason = f"the grader failed: {type(error).__name__}: {quote(str(error))}"
         detail, settled = _traceback(), False
     outcome = failed(
-        task,
+        hand_in,
         reason,
         authors=authors,
         out_of=rubric.out_of,
@@ -98,7 +99,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
     return replace(outcome, is_disk_full=no_room, original=original)
 
 
-def read_authors(task: Task, *, scratch: Path) -> tuple[str, ...]:
+def read_authors(hand_in: HandIn, *, scratch: Path) -> tuple[str, ...]:
     """Open one submission and return the author ids that it names, without grading it.
 
     Raises
@@ -108,10 +109,13 @@ def read_authors(task: Task, *, scratch: Path) -> tuple[str, ...]:
     with tempfile.TemporaryDirectory(
         dir=scratch, prefix="open-", ignore_cleanup_errors=True
     ) as folder:
-        sources = [Path(source) for source in task.sources]
-        opened = open_submission(sources, Path(folder) / task.id, digest=task.digest)
-        _repair(opened, task, _handed_in(opened))
+        opened = _open(hand_in, Path(folder))
+        _repair(opened, hand_in, _handed_in(opened))
         return named_authors(opened)
+
+
+def _open(hand_in: HandIn, scratch: Path) -> Path:
+    return open_submission(hand_in.sources, scratch / hand_in.id, digest=hand_in.digest)
 
 
 def _handed_in(folder: Path) -> str:
@@ -123,9 +127,9 @@ def _handed_in(folder: Path) -> str:
         return ""
 
 
-def _repair(folder: Path, task: Task, text: str) -> Repair | None:
+def _repair(folder: Path, hand_in: HandIn, text: str) -> Repair | None:
     """Write the repair of a text, if there is one, into the private copy of a submission."""
-    if (found := task.repairs.get(text_key(text))) is None:
+    if (found := hand_in.repairs.get(text_key(text))) is None:
         return None
     repair = Repair(**found)
     (folder / NAME).write_text(repair.text, encoding="utf-8", newline="\n")
@@ -202,10 +206,12 @@ def _prepare(
 
     def do(wanted: tuple[str, dict[str, Any]], _: object) -> dict[str, Any] | Sequence[str]:
         what, plain = wanted
-        task = Task(**{**plain, "sources": tuple(plain["sources"])})
+        hand_in = HandIn.read(plain)
         if what == "authors":
-            return read_authors(task, scratch=Path(scratch))
-        return plain_grading(grade_task(task, rubric=asked, scratch=Path(scratch), figures=figures))
+            return read_authors(hand_in, scratch=Path(scratch))
+        return plain_grading(
+            grade_hand_in(hand_in, rubric=asked, scratch=Path(scratch), figures=figures)
+        )
 
     return do
 

@@ -15,6 +15,7 @@ from pathlib import Path, PurePosixPath
 
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.grading.csv_table import read_table
+from pipeline.grading.gradings import HandIn
 from pipeline.grading.intake.unpack import (
     CLASS,
     DEEPEST,
@@ -38,30 +39,6 @@ _RESULTS = ("class.html", "feedback/.made.json")  # these mark the output folder
 _PARTS_OF_RESULTS = ("feedback", "gradescope")
 _DATA = "data"  # folder of recordings; its name is never the id of a hand-in
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
-
-
-@dataclass(frozen=True, kw_only=True)
-class HandIn:
-    """The files that one team submitted, before they are opened.
-
-    Attributes
-    ----------
-    id : id that is unique in the batch and valid as a folder name.
-    sources : one folder, or several files, which may be archives.
-    owner : account that submitted the files, with platform and account number, such as "Jane Doe
-        (moodle 1024)"; see `platforms.Account`; or "".
-    handed_in : time of the hand-in in ISO 8601, or "" if the platform does not give it.
-    problem : why the files cannot be opened, if this is already known; or "".
-    parent : name of the parent folder, which may be used to make the id unique.
-    """
-
-    id: str
-    sources: tuple[Path, ...] = ()
-    owner: str = ""
-    handed_in: str = ""
-    days_late: float = 0.0
-    problem: str = ""
-    parent: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

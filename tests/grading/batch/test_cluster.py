@@ -12,7 +12,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.batch.cluster import run_on
 from pipeline.grading.batch.runner import grade_batch, run_here
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Setup, Task
+from pipeline.grading.gradings import HandIn, Setup
 from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.rubric_file import load_rubric
 from tests.helpers.grading_students import write_team
@@ -103,4 +103,4 @@ def test_an_address_without_a_scheduler_is_an_error(monkeypatch):
         bound.bind(("127.0.0.1", 0))
         execute = run_on(f"tcp://127.0.0.1:{bound.getsockname()[1]}")
         with pytest.raises(ConfigError, match="no scheduler"):
-            list(execute([Task(id="t", key="k", sources=())], setup))
+            list(execute([HandIn(id="t", key="k", sources=())], setup))

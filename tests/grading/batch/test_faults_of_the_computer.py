@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.batch.worker import grade_task
+from pipeline.grading.batch.worker import grade_hand_in
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Task
+from pipeline.grading.gradings import HandIn
 from pipeline.grading.intake.unpack import HAND_IN, unpack
 from pipeline.grading.rubric_file import load_rubric
 from tests.helpers.grading_students import copy_step, write_team
@@ -105,18 +105,18 @@ def test_a_file_with_an_impossible_name_is_refused_for_good(tmp_path):
 _STARVED = """
 import json, resource, sys
 from pathlib import Path
-from pipeline.grading.gradings import Task
-from pipeline.grading.batch.worker import grade_task
+from pipeline.grading.gradings import HandIn
+from pipeline.grading.batch.worker import grade_hand_in
 from pipeline.grading.rubric_file import load_rubric
 
 source, scratch, limit, *soft = sys.argv[1:]
-task = Task(id="team", key="k", sources=(source,))
+task = HandIn(id="team", key="k", sources=(Path(source),))
 rubric = load_rubric(Path("throne-1dof"))
 which = getattr(resource, limit)
 hard = resource.getrlimit(which)[1]
 
 def grade():
-    outcome = grade_task(task, rubric=rubric, scratch=Path(scratch))
+    outcome = grade_hand_in(task, rubric=rubric, scratch=Path(scratch))
     return [outcome.settled, outcome.is_disk_full, outcome.reason, outcome.grade]
 
 told = [grade()]
@@ -184,7 +184,7 @@ def test_undecodable_content_is_refused_for_good(tmp_path):
     content[60:70] = b"\xff" * 10  # these are compressed bytes
     archive = tmp_path / "broken.zip"
     archive.write_bytes(content)
-    outcome = grade_task(
-        Task(id="team", key="k", sources=(str(archive),)), rubric=RUBRIC, scratch=tmp_path
+    outcome = grade_hand_in(
+        HandIn(id="team", key="k", sources=(archive,)), rubric=RUBRIC, scratch=tmp_path
     )
     assert (outcome.status, outcome.settled) == ("failed", True)

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from pipeline.grading.batch.runner import Grader, code_version, grade_batch, run_here
-from pipeline.grading.batch.worker import grade_task, named_authors, read_authors
+from pipeline.grading.batch.worker import grade_hand_in, named_authors, read_authors
 from pipeline.grading.grade import grade_text, read_grade
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Example, Setup, Task
+from pipeline.grading.gradings import Example, HandIn, Setup
 from pipeline.grading.intake.files import digest, packed, unpacked
 from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.platforms import PLATFORMS
@@ -123,7 +123,7 @@ def test_only_what_changed_is_graded_again(school, graded, tmp_path):
 
 @pytest.fixture
 def task(school):
-    return Task(id="team-0", key="k", sources=(str(school / "team-0"),))
+    return HandIn(id="team-0", key="k", sources=(school / "team-0",))
 
 
 @pytest.fixture
@@ -173,7 +173,7 @@ def test_a_grade_is_kept_if_its_figures_fail(task, tmp_path, monkeypatch):
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr(feedback_figures, "draw_figures", undrawable)
-    outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path, figures=True)
+    outcome = grade_hand_in(task, rubric=RUBRIC, scratch=tmp_path, figures=True)
 
     assert (outcome.status, outcome.figures, outcome.settled) == ("graded", (), False)
     assert json.loads(outcome.grade)["points"] > 0
@@ -183,7 +183,7 @@ def test_a_grade_is_kept_if_its_figures_fail(task, tmp_path, monkeypatch):
 def test_a_fault_of_this_machine_is_tried_again(task, tmp_path):
     """If the scratch folder cannot be written, the row says so and the next run tries again."""
     (tmp_path / "scratch").touch()  # no folder can be made in a file
-    outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path / "scratch")
+    outcome = grade_hand_in(task, rubric=RUBRIC, scratch=tmp_path / "scratch")
     assert (outcome.status, outcome.settled) == ("failed", False)
     assert "be read" in outcome.reason
 
@@ -200,10 +200,10 @@ def test_memory_is_limited(school, setup, tmp_path):
     (large / "data" / "step-1.csv").write_text("time,input,x1\n" + rows, encoding="utf-8")
     small = replace(setup, memory_limit=100_000_000)
     with closing(Grader(small)) as worker:
-        outcome = worker.run(Task(id="large", key="k", sources=(str(large),)))
+        outcome = worker.run(HandIn(id="large", key="k", sources=(large,)))
         assert not outcome.settled
         assert "0.1 GB" in outcome.reason
-        again = worker.run(Task(id="t", key="k", sources=(str(school / "team-0"),)))
+        again = worker.run(HandIn(id="t", key="k", sources=(school / "team-0",)))
         assert again.status == "graded"
 
 
@@ -248,7 +248,7 @@ def test_the_files_of_a_stopped_submission_name_its_authors(school, tmp_path):
 def test_authors_are_read_however_they_are_written(text, tmp_path):
     """Authors are found in tables, in a list, and in a file that is not valid TOML."""
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
-    task = Task(id="team", key="k", sources=(str(tmp_path),))
+    task = HandIn(id="team", key="k", sources=(tmp_path,))
     assert read_authors(task, scratch=tmp_path.parent) == ("s1", "s2")
 
 
@@ -270,7 +270,7 @@ def test_strange_authors_are_no_authors(text, tmp_path):
 def test_an_error_of_the_grader_is_tried_again(task, tmp_path):
     """If the grader itself fails, the traceback is kept, and the next run tries again."""
     broken = RUBRIC.model_copy(update={"system": None})  # stands for an invalid rubric
-    outcome = grade_task(task, rubric=broken, scratch=tmp_path)
+    outcome = grade_hand_in(task, rubric=broken, scratch=tmp_path)
     assert (outcome.status, outcome.settled) == ("failed", False)
     assert "AttributeError" in outcome.reason
     assert "Traceback" in outcome.detail
@@ -285,8 +285,8 @@ def test_an_unreadable_submission_keeps_its_authors(school, tmp_path, slip, type
     """The authors of an unreadable submission are still known, so points by hand reach them."""
     own = shutil.copytree(school / "team-0", tmp_path / "team-0")
     change(own, slip, typed)
-    task = Task(id="team-0", key="k", sources=(str(own),))
-    outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path)
+    task = HandIn(id="team-0", key="k", sources=(own,))
+    outcome = grade_hand_in(task, rubric=RUBRIC, scratch=tmp_path)
     assert outcome.authors == ("s0",)
 
 
@@ -295,13 +295,13 @@ def test_files_that_change_during_the_grading_are_not_graded(task, tmp_path, sch
     own = shutil.copytree(school / "team-0", tmp_path / "team-0")
     if sys.platform == "linux":  # only Linux allows this file name
         (own / "n\udcff").write_text("no name in any encoding", encoding="utf-8")
-    known = replace(task, sources=(str(own),), digest=digest([own]))
-    assert grade_task(known, rubric=RUBRIC, scratch=tmp_path).status == "graded"
+    known = replace(task, sources=(own,), digest=digest([own]))
+    assert grade_hand_in(known, rubric=RUBRIC, scratch=tmp_path).status == "graded"
     unpacked(packed([own]), tmp_path / "travelled")  # as on a cluster
-    there = replace(known, sources=(str(tmp_path / "travelled"),))
-    assert grade_task(there, rubric=RUBRIC, scratch=tmp_path).status == "graded"
+    there = replace(known, sources=(tmp_path / "travelled",))
+    assert grade_hand_in(there, rubric=RUBRIC, scratch=tmp_path).status == "graded"
     (own / "notes.md").write_text("one more word", encoding="utf-8")
-    outcome = grade_task(known, rubric=RUBRIC, scratch=tmp_path)
+    outcome = grade_hand_in(known, rubric=RUBRIC, scratch=tmp_path)
     assert (outcome.status, outcome.settled) == ("failed", False)
     assert "changed" in outcome.reason
 

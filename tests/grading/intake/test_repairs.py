@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch.worker import grade_task
-from pipeline.grading.gradings import Grading, Task
+from pipeline.grading.batch.worker import grade_hand_in
+from pipeline.grading.gradings import Grading, HandIn
 from pipeline.grading.intake.repairs import (
     FOLDER,
     Repair,
@@ -44,8 +44,8 @@ def test_a_repair_counts_only_for_its_text(tmp_path):
     def graded(text: str, **repairs: Repair) -> Grading:
         toml.write_bytes(text.encode())
         plain = {key: asdict(repair) for key, repair in repairs.items()}
-        task = Task(id="team-07", key="k", sources=(str(folder),), repairs=plain)
-        return grade_task(task, rubric=rubric, scratch=scratch)
+        task = HandIn(id="team-07", key="k", sources=(folder,), repairs=plain)
+        return grade_hand_in(task, rubric=rubric, scratch=scratch)
 
     failed = graded(wrong)
     assert (failed.status, failed.original) == ("failed", wrong)

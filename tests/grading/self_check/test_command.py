@@ -7,9 +7,9 @@ import sys
 import jsonschema
 import pytest
 
-from pipeline.grading.batch.worker import grade_task
+from pipeline.grading.batch.worker import grade_hand_in
 from pipeline.grading.grade import read_grade
-from pipeline.grading.gradings import Task
+from pipeline.grading.gradings import HandIn
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.self_check.answers import FILE, read_answers
 from pipeline.resources import RUBRICS
@@ -162,8 +162,8 @@ def test_the_grade_says_how_often_the_check_was_run(in_hertz, tmp_path):
     check(in_hertz)
 
     def note() -> str:
-        task = Task(id="team", key="k", sources=(str(in_hertz),))
-        graded = grade_task(task, rubric=load_rubric(RUBRIC), scratch=tmp_path)
+        task = HandIn(id="team", key="k", sources=(in_hertz,))
+        graded = grade_hand_in(task, rubric=load_rubric(RUBRIC), scratch=tmp_path)
         return read_grade(graded.grade).notes[-1]
 
     assert "2 times" in note()
