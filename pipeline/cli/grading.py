@@ -232,7 +232,7 @@ def _change(
     change: "Callable[[Gradebook, str], object]",
 ) -> None:
     """Change the points of a team, which may be a pseudonym, and say its new total."""
-    from pipeline.grading.publish.view import resolve_pseudonym
+    from pipeline.grading.publish.pseudonyms import resolve_pseudonym
 
     with _changing(grades, assignment) as book:
         name = resolve_pseudonym(book, team)
@@ -248,7 +248,7 @@ def _override_from(grades: str, table: Path, *, why: str, by: str, assignment: s
     from dataclasses import replace
 
     from pipeline.grading.gradebook.decisions import read_wishes
-    from pipeline.grading.publish.view import resolve_pseudonym
+    from pipeline.grading.publish.pseudonyms import resolve_pseudonym
     from pipeline.words.numbers import count
 
     wishes = read_wishes(table, why=why)
@@ -279,7 +279,7 @@ def remove(
     ] = False,
 ) -> None:
     """Take submissions off the class list; their history stays, unless --erase deletes it."""
-    from pipeline.grading.publish.view import resolve_pseudonym
+    from pipeline.grading.publish.pseudonyms import resolve_pseudonym
 
     if erase:
         _erase(grades, teams, assignment)
@@ -343,7 +343,7 @@ def history(grades: Grades, team: Team, assignment: Lab = None, as_json: AsJson 
     """Show every grade and change of a team, with who, when and why."""
     from pipeline.grading.gradebook.gradebook import Gradebook
     from pipeline.grading.gradebook.history import history_dict, history_text
-    from pipeline.grading.publish.view import history_of
+    from pipeline.grading.publish.pseudonyms import history_of
 
     with Gradebook(grades, assignment=assignment) as book:
         submission, events = history_of(book, team)

@@ -10,9 +10,9 @@ from typing import Any
 
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.decisions import points_lost
-from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import Entry
 from pipeline.grading.gradebook.gradebook import ClassNow, Gradebook, State
-from pipeline.grading.publish.view import anonymise, pseudonyms
+from pipeline.grading.publish.pseudonyms import anonymise, pseudonyms
 from pipeline.grading.rubric import Rubric
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import count
 
 from pipeline.grading.grade import Criterion
-from pipeline.grading.gradebook.entry import Event, hide_people
+from pipeline.grading.gradebook.events import Event, hide_people
 from pipeline.grading.gradebook.history import to_the_second
 from pipeline.grading.publish.feedback import numbers_table, sentence
 from pipeline.grading.words import points_text

@@ -16,7 +16,7 @@ import pytest
 from pipeline.desk.app import DeskServer
 from pipeline.desk.grades.criteria import point_steps
 from pipeline.grading.grade import Flag
-from pipeline.grading.gradebook.entry import Event
+from pipeline.grading.gradebook.events import Event
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch
 from pipeline.grading.intake.repairs import Run, read_run, save_run

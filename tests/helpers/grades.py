@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.grading.batch.worker import grade_hand_in
 from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
 from pipeline.grading.gradebook.database import FILE
-from pipeline.grading.gradebook.entry import Entry, Request
+from pipeline.grading.gradebook.events import Entry, Request
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch, Grading, HandIn, Setup
 from pipeline.grading.publish.outputs import write_outputs

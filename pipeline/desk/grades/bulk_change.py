@@ -10,14 +10,14 @@ from starlette.responses import Response
 from pipeline.desk.gradebooks import ClassView
 from pipeline.desk.grades.class_table import find_signature, open_gradebook, read_class
 from pipeline.desk.grades.criteria import list_steps
-from pipeline.desk.grades.filters import Filter
+from pipeline.desk.grades.review_order import Filter
 from pipeline.desk.grades.team_page import sign, write_address
 from pipeline.desk.page_request import PageRequest
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.decisions import Conflict, WantedPoints, read_points
-from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import Entry
 from pipeline.grading.publish.feedback import sentence
-from pipeline.grading.publish.view import STRANGER
+from pipeline.grading.publish.pseudonyms import STRANGER
 from pipeline.grading.rubric import Criterion
 from pipeline.grading.words import WORDS, points_text
 from pipeline.words.numbers import count

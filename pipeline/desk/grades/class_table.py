@@ -11,22 +11,23 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk.gradebooks import ClassView
-from pipeline.desk.grades.filters import Filter
 from pipeline.desk.grades.grading_form import GradingForm, fill_form, show_unfinished
+from pipeline.desk.grades.review_order import Filter
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing, show_own_page
 from pipeline.desk.users import name_place
 from pipeline.grading.grade import CODES
-from pipeline.grading.gradebook.entry import TOTAL, Entry
+from pipeline.grading.gradebook.events import TOTAL, Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import to_the_second
 from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.class_page import class_page, not_final
 from pipeline.grading.publish.feedback import feedback_page
 from pipeline.grading.publish.outputs import repeated_authors_of
-from pipeline.grading.publish.view import STRANGER, view
+from pipeline.grading.publish.pseudonyms import STRANGER
+from pipeline.grading.publish.view import view
 from pipeline.grading.similarity.class_questions import find_distant, recomputed_numbers
-from pipeline.grading.similarity.shared_data import find_clusters, renamed
+from pipeline.grading.similarity.shared_flag import find_clusters, renamed
 from pipeline.grading.words import WORDS, points_text, signed_points
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import drawing, to_svg

@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.desk.shown_criterion import show_message, show_numbers
 from pipeline.grading.grade import Criterion, Flag, Grade
-from pipeline.grading.gradebook.entry import Entry, Event
+from pipeline.grading.gradebook.events import Entry, Event
 from pipeline.grading.publish.feedback import TONES, alternative, evidence_table, sentence
 from pipeline.grading.publish.feedback_figures import is_response, numbers_in
 from pipeline.grading.rubric import Criterion as Asked

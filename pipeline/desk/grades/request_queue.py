@@ -14,7 +14,7 @@ from pipeline.desk.page_request import PageRequest
 from pipeline.desk.shown_criterion import describe_steps
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.decisions import MOST_LETTERS, Conflict, RequestRefused, read_points
-from pipeline.grading.gradebook.entry import Entry, Request
+from pipeline.grading.gradebook.events import Entry, Request
 from pipeline.grading.publish.feedback import sentence
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import points_text

@@ -28,8 +28,8 @@ from pipeline.desk.grades.criteria import (
     list_items,
     show_figures,
 )
-from pipeline.desk.grades.filters import Filter
 from pipeline.desk.grades.grading_form import last_run, start_grading
+from pipeline.desk.grades.review_order import Filter
 from pipeline.desk.jobs import Busy
 from pipeline.desk.last_report import PLOTS, PLOTS_OF
 from pipeline.desk.page_request import PageRequest
@@ -37,7 +37,7 @@ from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.decisions import Conflict, read_points
-from pipeline.grading.gradebook.entry import TOTAL, Entry
+from pipeline.grading.gradebook.events import TOTAL, Entry
 from pipeline.grading.gradebook.history import event_words, to_the_second
 from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.repairs import (
@@ -50,7 +50,6 @@ from pipeline.grading.intake.repairs import (
     text_key,
 )
 from pipeline.grading.publish.class_page import feedback_link
-from pipeline.grading.publish.view import renamed_events
 from pipeline.grading.rubric import Rubric, find_remarks
 from pipeline.grading.words import WORDS, person_lines, points_text, slip_of
 from pipeline.output import LOCK
@@ -197,9 +196,7 @@ def _show_page(
     team = find_team(shown, ask.query("of"))
     book, name = open_gradebook(ask), team.grade.submission
     now, grade = team, team.grade
-    _, events = book.history(team.submission, named=not now.rubric.anonymous)
-    if shown.names is not None:
-        events = renamed_events(events, team.submission, name)
+    _, events = book.history(team.submission, shown_as=name if now.rubric.anonymous else "")
     wanted = Filter.read(ask.request.query_params)
     before, after = wanted.beside(shown, name)
     items = list_items(grade, now)

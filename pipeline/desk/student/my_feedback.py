@@ -14,7 +14,7 @@ from pipeline.desk.users import REFUSED, OwnGrade
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion, Grade
 from pipeline.grading.gradebook.decisions import MOST_LETTERS, RequestRefused, points_lost
-from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.publish.feedback import TONES, feedback_page, sentence
 from pipeline.grading.publish.view import GradeView, view

@@ -13,13 +13,14 @@ from typing import Any
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.batch.runner import Executor, Progress, grade_batch, run_here, silent
 from pipeline.grading.gradebook.database import Lost
+from pipeline.grading.gradebook.events import hidden_reason
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Batch, Example, HandIn, Setup
 from pipeline.grading.intake.find import find_hand_ins, read_late_table, settle_lateness
 from pipeline.grading.intake.repairs import Run, save_run
 from pipeline.grading.publish.class_page import wrong_springs
 from pipeline.grading.publish.outputs import write_outputs
-from pipeline.grading.publish.view import STRANGER, hidden_reason, pseudonyms_in
+from pipeline.grading.publish.pseudonyms import STRANGER, pseudonyms_in
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import find_rubric, load_rubric
 from pipeline.grading.similarity.fingerprints import fingerprint

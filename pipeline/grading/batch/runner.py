@@ -29,7 +29,7 @@ from pipeline.grading.intake.repairs import FOLDER, Repair, keep_original, read_
 from pipeline.grading.platforms import Account, same_number
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.copies import find_copies, same_recordings, same_team
-from pipeline.grading.similarity.shared_data import shared_flag
+from pipeline.grading.similarity.shared_flag import shared_flag
 from pipeline.grading.similarity.tables import Key, TypedNumber, find_shared_tables, typed_numbers
 from pipeline.processes import Ended, Failed, Supervisor
 from pipeline.resources import TEMPLATES

@@ -11,7 +11,7 @@ from pathlib import Path
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.entry import TOTAL, Entry, Event
+from pipeline.grading.gradebook.events import TOTAL, Entry, Event
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.tolerance import exact
 from pipeline.grading.words import points_text

@@ -20,7 +20,7 @@ from pipeline.grading.grade import Grade, read_grade
 from pipeline.grading.gradebook import decisions
 from pipeline.grading.gradebook.database import Database
 from pipeline.grading.gradebook.decisions import Conflict, RequestRefused, WantedPoints
-from pipeline.grading.gradebook.entry import (
+from pipeline.grading.gradebook.events import (
     POINTS,
     TOTAL,
     Entry,
@@ -391,8 +391,8 @@ class Gradebook:
         with self._database.reading() as connection:
             return connection.scalar(mine) or ""
 
-    def history(self, team: str, *, named: bool = True) -> tuple[str, list[Event]]:
-        """Return the id of a submission and all its events; see `read_history`.
+    def history(self, team: str, *, shown_as: str = "") -> tuple[str, list[Event]]:
+        """Return the name of a submission and all its events; see `read_history`.
 
         Raises
         ------
@@ -400,7 +400,8 @@ class Gradebook:
         """
         with self._database.reading() as connection:
             row = self._find_ever(connection, team)
-            return row.name, read_history(connection, row.submission_id, named=named)
+            name, number = row.name, row.submission_id
+            return shown_as or name, read_history(connection, number, name, shown_as=shown_as)
 
     def remove(self, teams: Sequence[str]) -> list[str]:
         """Remove submissions from the class list; return their names.

@@ -12,11 +12,12 @@ from pydantic import ValidationError
 from sqlalchemy import Connection, and_, select
 
 from pipeline.grading.grade import read_grade
-from pipeline.grading.gradebook.entry import (
+from pipeline.grading.gradebook.events import (
     POINTS,
     REQUESTS,
     TOTAL,
     Event,
+    hidden_reason,
     hide_people,
 )
 from pipeline.grading.gradebook.rows import read_events
@@ -25,24 +26,36 @@ from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import on_one_line, points_text
 from pipeline.submission.load import NAME
 
-FAILED = "could not be graded: "  # precedes the reason in the text of an event
+_FAILED = "could not be graded: "  # precedes the reason in the text of an event
 _SHOWN = ("at", "what", "points", "out_of", "criterion", "text", "by")
 
 
-def read_history(connection: Connection, submission: int, *, named: bool = True) -> list[Event]:
+def read_history(
+    connection: Connection, submission: int, name: str, *, shown_as: str = ""
+) -> list[Event]:
     """Return the events of one submission, oldest first.
 
     Parameters
     ----------
-    named : whether texts may contain names of people and other names of the submission.
+    shown_as : name that texts contain in place of the submission's `name`; they then contain no
+        names of people and no other names of the submission. "" to show names.
     """
+    named = not shown_as
     done = read_events(connection, events.c.submission_id == submission).get(submission, ())
     found = [
         *_graded(connection, submission),
         *(_shown(event, named=named) for event in done if event.what in POINTS + REQUESTS),
         *_listed(connection, submission, named=named),
     ]
+    found = found if named else [_renamed(event, name, shown_as) for event in found]
     return sorted(found, key=lambda event: event.at)
+
+
+def _renamed(event: Event, name: str, shown_as: str) -> Event:
+    text = event.text
+    if text.startswith(_FAILED):
+        text = _FAILED + hidden_reason(text.removeprefix(_FAILED), name, shown_as)
+    return replace(event, text=text.replace(name, shown_as))
 
 
 def _shown(event: Event, *, named: bool) -> Event:
@@ -62,7 +75,7 @@ def _graded(connection: Connection, submission: int) -> Iterator[Event]:
         grade = read_grade(row.grade)
         said = [f"{NAME} repaired {grade.repaired}"] if grade.repaired else []
         if row.status == "failed":
-            text = "; ".join([FAILED + on_one_line(row.reason), *said])
+            text = "; ".join([_FAILED + on_one_line(row.reason), *said])
         else:
             text = ", ".join([*said, *(flag.code for flag in grade.flags)])
         yield Event(at=row.at, what="graded", points=row.points, out_of=row.out_of, text=text)

@@ -24,7 +24,7 @@ from sqlalchemy import (
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, read_grade
 from pipeline.grading.gradebook.database import Database
-from pipeline.grading.gradebook.entry import REQUESTS, Entry, Event
+from pipeline.grading.gradebook.events import REQUESTS, Entry, Event
 from pipeline.grading.gradebook.schema import (
     batches,
     drop_copied,

@@ -36,7 +36,7 @@ from sqlalchemy import (
 )
 
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.entry import TOTAL
+from pipeline.grading.gradebook.events import TOTAL
 
 _VERSION = "2"
 _TURN = 0x6361_7274  # number of PostgreSQL's advisory lock, chosen so that no other program uses it

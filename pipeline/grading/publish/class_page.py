@@ -14,7 +14,7 @@ from pipeline.grading.class_frame import class_frame
 from pipeline.grading.grade import CODES, Code, Grade
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.class_questions import Distant, RepeatedAuthors
-from pipeline.grading.similarity.shared_data import Cluster
+from pipeline.grading.similarity.shared_flag import Cluster
 from pipeline.grading.tolerance import exact
 from pipeline.grading.words import WORDS, on_one_line, points_text, signed_points
 from pipeline.report.builder import PageBuilder, Part

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradescope import results_text
 from pipeline.grading.platforms import PLATFORMS, Platform

@@ -14,7 +14,8 @@ from pipeline.grading.grade import Flag, Grade, grade_text
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import feedback_page
-from pipeline.grading.publish.view import KEY_FILE, STRANGER, key_text, pseudonyms, view
+from pipeline.grading.publish.pseudonyms import KEY_FILE, STRANGER, key_text, pseudonyms
+from pipeline.grading.publish.view import view
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.class_questions import (
     Quantity,
@@ -24,7 +25,7 @@ from pipeline.grading.similarity.class_questions import (
     recomputed_numbers,
     with_recordings,
 )
-from pipeline.grading.similarity.shared_data import find_clusters, renamed
+from pipeline.grading.similarity.shared_flag import find_clusters, renamed
 from pipeline.grading.words import on_one_line
 from pipeline.output import csv_text, own_folder, write_file
 from pipeline.resources import TEMPLATES

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import Entry
 from pipeline.grading.gradings import person
 from pipeline.grading.platforms import Account, Platform, bare_number, read_number
 from pipeline.grading.publish.view import GradeView, view

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.entry import Entry, with_overrides
+from pipeline.grading.gradebook.events import Entry, with_overrides
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.judge.award import needs_recordings, read_findings, recompute_points
 from pipeline.grading.judge.context import Judgement

@@ -10,7 +10,7 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion, Grade, read_grade
 from pipeline.grading.gradebook.decisions import Conflict, points_lost, read_wishes
-from pipeline.grading.gradebook.entry import TOTAL
+from pipeline.grading.gradebook.events import TOTAL
 from pipeline.grading.gradebook.history import history_text
 from pipeline.grading.gradescope import results_text
 from pipeline.grading.judge.award import findings_text, read_findings, recompute_points

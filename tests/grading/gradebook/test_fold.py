@@ -13,7 +13,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook import decisions
 from pipeline.grading.gradebook.decisions import WantedPoints
-from pipeline.grading.gradebook.entry import POINTS, TOTAL, Entry, Event
+from pipeline.grading.gradebook.events import POINTS, TOTAL, Entry, Event
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.total import with_total
 from tests.helpers.grades import book_of, make_grade, two_cart_rubric

@@ -18,7 +18,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.grade import CODES
 from pipeline.grading.gradebook import rows
 from pipeline.grading.gradebook.database import FILE
-from pipeline.grading.gradebook.entry import with_overrides
+from pipeline.grading.gradebook.events import with_overrides
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import history_dict, history_text
 from pipeline.grading.gradebook.schema import metadata

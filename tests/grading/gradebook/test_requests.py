@@ -15,7 +15,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.decisions import MOST_LETTERS, MOST_OPEN, Conflict, RequestRefused
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradebook.history import history_text
-from pipeline.grading.publish.view import history_of, pseudonyms_in
+from pipeline.grading.publish.pseudonyms import history_of, pseudonyms_in
 from tests.helpers.grades import book_of, failed_grade, finish, make_grade, seen, two_cart_rubric
 from tests.helpers.grading_students import criterion
 from tests.helpers.places import ROOT

@@ -18,12 +18,13 @@ from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import CODES, Adjustment, Flag, Grade
 from pipeline.grading.gradebook.decisions import read_points
-from pipeline.grading.gradebook.entry import Event, with_overrides
+from pipeline.grading.gradebook.events import Event, with_overrides
 from pipeline.grading.gradescope import results_text
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.publish.feedback import evidence_table, feedback_page, numbers_table
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
-from pipeline.grading.publish.view import KEY_FILE, anonymise, new_view, pseudonyms
+from pipeline.grading.publish.pseudonyms import KEY_FILE, anonymise, pseudonyms
+from pipeline.grading.publish.view import new_view
 from pipeline.grading.words import WORDS
 from pipeline.setup import Units
 from pipeline.words.text import plain

@@ -11,7 +11,7 @@ from pipeline.grading.gradings import Member
 from pipeline.grading.similarity import copies
 from pipeline.grading.similarity.copies import find_copies, same_recordings
 from pipeline.grading.similarity.fingerprints import fingerprint, unpack
-from pipeline.grading.similarity.shared_data import shared_flag
+from pipeline.grading.similarity.shared_flag import shared_flag
 from pipeline.ingest.read import read_data
 from pipeline.simulated.bench import COUNT, SimulatedBench
 from pipeline.simulated.hidden import preset_bench

@@ -7,9 +7,9 @@ from pipeline.grading.batch.runner import grade_batch
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.gradings import Example, Member, Setup
 from pipeline.grading.intake.find import find_hand_ins
-from pipeline.grading.publish.view import anonymise
+from pipeline.grading.publish.pseudonyms import anonymise
 from pipeline.grading.similarity.copies import SharedRecord
-from pipeline.grading.similarity.shared_data import find_clusters, shared_flag, student_message
+from pipeline.grading.similarity.shared_flag import find_clusters, shared_flag, student_message
 from pipeline.grading.similarity.tables import TypedNumber, find_shared_tables
 from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric
 

@@ -7,7 +7,7 @@ from urllib.parse import urlencode
 
 from pipeline.desk.gradebooks import ClassView
 from pipeline.grading.grade import CODES
-from pipeline.grading.gradebook.entry import Entry
+from pipeline.grading.gradebook.events import Entry
 from pipeline.grading.words import WORDS, slip_of
 
 _STATES: Mapping[str, tuple[str, Callable[[Entry], bool]]] = {

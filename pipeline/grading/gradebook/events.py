@@ -1,6 +1,6 @@
-"""A submission of the class list as it stands now: its grading, its events, and the fold of both.
+"""What people do to a submission, as events in order, and their fold: its entry as it stands now.
 
-An event is what a person did, in order. Nothing else is stored of it.
+Nothing else is stored of what people do. The grade, the requests and the review all follow from it.
 """
 
 import re
@@ -88,10 +88,23 @@ class Request:
         return self.events[-1].what
 
 
+# The name of an archive at the beginning of a reason.
+_ARCHIVE = re.compile(r"^.*?\.zip\W?: ", re.IGNORECASE)
+
+
 def hide_people(text: str, people: Iterable[str]) -> str:
     """Return a text in which the names in `people` are replaced."""
     known = "|".join(re.escape(one) for one in people if one)
     return re.sub(rf"(?<!\w)(?:{known})(?!\w)", "…", text, flags=re.IGNORECASE) if known else text
+
+
+def hidden_reason(reason: str, submission: str, own: str) -> str:
+    """Return the reason why a submission could not be graded, with `own` in place of its name."""
+    if not reason:
+        return ""
+    name = re.escape(submission)
+    path = re.compile(rf"^{name}(?=:)|(?<![^\s'\"(]){name}(?=[/\\])", re.MULTILINE)
+    return path.sub(own, _ARCHIVE.sub("the archive: ", reason))
 
 
 def with_comments(grade: Grade, comments: Mapping[str, Event]) -> Grade:
