@@ -8,6 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from starlette.exceptions import HTTPException
+
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.decisions import points_lost
 from pipeline.grading.gradebook.events import Entry
@@ -43,6 +45,13 @@ class ClassView:
             teams = [replace(one, graded=anonymise(one.graded, self.names)) for one in teams]
             teams.sort(key=lambda team: team.grade.submission)
         return {team.grade.submission: team for team in teams}
+
+    def team(self, name: str) -> Entry:
+        """Return a team by its name as pages show it."""
+        team = self.teams.get(name)
+        if team is None:
+            raise HTTPException(404, "no submission of this class has this name")
+        return team
 
     @cached_property
     def lost(self) -> Mapping[str, set[str]]:

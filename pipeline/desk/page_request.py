@@ -19,12 +19,13 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from pipeline import __version__
 from pipeline.desk.benches import Benches
 from pipeline.desk.browse import find_root
-from pipeline.desk.gradebooks import Gradebooks
+from pipeline.desk.gradebooks import ClassView, Gradebooks
 from pipeline.desk.jobs import Job, Jobs, WorkerPool
 from pipeline.desk.navigation import list_links
 from pipeline.desk.parts import leave_out_parts
 from pipeline.desk.users import Place, User, Visibility, name_place
 from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.words import points_text
 from pipeline.processes import Failed
 from pipeline.resources import TEMPLATES
@@ -178,6 +179,34 @@ class PageRequest:
         if self.place is None:
             raise HTTPException(404, "you have no access to anything here")
         return self.place
+
+    @property
+    def gradebook(self) -> Gradebook:
+        """The gradebook that the URL names."""
+        return self.desk.gradebooks.gradebook(self.place_or_404())
+
+    @property
+    def class_view(self) -> ClassView:
+        """The class that the URL names, in its current state."""
+        return self.desk.gradebooks.of(self.place_or_404())
+
+    @property
+    def signature(self) -> str:
+        """The name with which a person's changes are signed; "" if it is not known yet."""
+        return self.user.name or self.desk.gradebooks.signed
+
+    def sign(self) -> str:
+        """Return the name that signs a change: from the proxy, or typed once by the person.
+
+        Raises
+        ------
+        ConfigError : no name is known.
+        """
+        if not self.user.name:
+            self.desk.gradebooks.signed = self.text("by") or self.desk.gradebooks.signed
+        if not self.signature:
+            raise ConfigError("enter your name first: every change by hand is signed")
+        return self.signature
 
     def require_place(self) -> None:
         """Refuse the request if its folder was moved or deleted, or its disk is not connected.

@@ -8,10 +8,9 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk.gradebooks import ClassView
-from pipeline.desk.grades.class_table import find_signature, open_gradebook, read_class
 from pipeline.desk.grades.criteria import list_steps
 from pipeline.desk.grades.review_order import Filter
-from pipeline.desk.grades.team_page import sign, write_address
+from pipeline.desk.grades.team_page import write_address
 from pipeline.desk.page_request import PageRequest
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.decisions import Conflict, WantedPoints, read_points
@@ -62,7 +61,7 @@ def apply(ask: PageRequest) -> Response:
     """Change all ticked teams, or undo a set of changes."""
     if ask.text("do") == "undo":
         return _undo(ask)
-    shown, by = read_class(ask), sign(ask)
+    shown, by = ask.class_view, ask.sign()
     asked = _find_criterion(ask, shown)
     ticked = ask.form.getlist("team")
     try:
@@ -70,7 +69,7 @@ def apply(ask: PageRequest) -> Response:
             raise ConfigError("tick at least one team")
         typed = _read_typed(ask)
         wishes = [_wish(ask, shown, asked, str(name), typed=typed) for name in ticked]
-        done = open_gradebook(ask).change_all(wishes, by=by)
+        done = ask.gradebook.change_all(wishes, by=by)
     except Conflict:
         text = "Some of these teams have changed since this list was shown. Nothing was changed."
         return _show_page(ask, wrong=text, status=409)
@@ -85,10 +84,10 @@ def apply(ask: PageRequest) -> Response:
 
 def _undo(ask: PageRequest) -> Response:
     """Undo a set of changes. Teams that were changed again since keep theirs and are named."""
-    shown, book = read_class(ask), open_gradebook(ask)
+    shown, book = ask.class_view, ask.gradebook
     if ask.text("set") not in [one.at for one in book.changed_together(least=1)]:
         raise HTTPException(404, "there is no such change in this class")
-    undone = book.undo_all(ask.text("set"), by=sign(ask))
+    undone = book.undo_all(ask.text("set"), by=ask.sign())
     message = f"{count(undone.teams, 'team')} undone."
     if undone.kept:
         names = {team.submission: name for name, team in shown.teams.items()}
@@ -152,7 +151,7 @@ def _wish(
 
 
 def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Response:
-    shown = read_class(ask)
+    shown = ask.class_view
     asked = _find_criterion(ask, shown)
     wanted = Filter.read(ask.request.query_params)
     typed = _read_typed(ask)
@@ -176,11 +175,11 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
         chosen=typed if typed in (*steps, _SAME) else "",
         other="" if typed in (*steps, _SAME) else typed,
         why=ask.text("why"),
-        usual=next(iter(open_gradebook(ask).reasons().get(asked.id, [])), ""),
+        usual=next(iter(ask.gradebook.reasons().get(asked.id, [])), ""),
         rows=rows,
         ticked=sum(row.ticked for row in rows),
         wrong=wrong,
-        signature=find_signature(ask),
+        signature=ask.signature,
         back=_back(ask, team, asked) if team in shown.teams else f"{ask.here}?{wanted.query}",
         team=team if team in shown.teams else "",
         wider=_widen(ask, shown, wanted),
@@ -226,7 +225,7 @@ def _list_rows(
     if typed == _SAME:  # a criterion that was never judged has no points to keep
         names = [name for name in names if asked.id in shown.teams[name].grade.judged]
     wishes = [_wish(ask, shown, asked, name, typed=typed) for name in names]
-    tried = {both[0].submission: both for both in open_gradebook(ask).preview_all(wishes)}
+    tried = {both[0].submission: both for both in ask.gradebook.preview_all(wishes)}
     began = ask.text("listed") == "1"
     rows = []
     for name in names:

@@ -9,10 +9,9 @@ from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from pipeline.desk.grades.class_table import may_release, open_gradebook, read_class
+from pipeline.desk.grades.class_table import may_release
 from pipeline.desk.grades.class_table import show as show_class
 from pipeline.desk.grades.grading_form import grade_again, show_unfinished
-from pipeline.desk.grades.team_page import sign
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import scratch_folder
 from pipeline.errors import ConfigError
@@ -25,8 +24,8 @@ from pipeline.words.numbers import count
 
 def take_table(ask: PageRequest) -> Response:
     """Change points from an uploaded table, either all of them or none."""
-    shown = read_class(ask)
-    by = sign(ask)
+    shown = ask.class_view
+    by = ask.sign()
     with scratch_folder() as scratch:
         table = _store_upload(ask, "table", scratch / "the table")
         if table is None:
@@ -38,7 +37,7 @@ def take_table(ask: PageRequest) -> Response:
         if wish.submission not in teams:
             raise ConfigError(f"line {wish.line}: no submission of this class has this name")
         meant.append(replace(wish, submission=teams[wish.submission]))
-    done = open_gradebook(ask).change_all(meant, by=by)
+    done = ask.gradebook.change_all(meant, by=by)
     message = f"{count(done.teams, 'change')} imported"
     if unchanged := len(meant) - done.teams:
         message += f"; {count(unchanged, 'row')} changed nothing"
@@ -47,12 +46,12 @@ def take_table(ask: PageRequest) -> Response:
 
 def accept(ask: PageRequest) -> Response:
     """Mark the ticked teams as reviewed; a team that changed since it was listed is not."""
-    shown, by = read_class(ask), sign(ask)
+    shown, by = ask.class_view, ask.sign()
     ticked = [str(name) for name in ask.form.getlist("team")]
     if not ticked or any(name not in shown.teams for name in ticked):
         raise ConfigError("tick at least one team of the class")
     seen = {shown.teams[name].submission: ask.text(f"seen.{name}") for name in ticked}
-    done = open_gradebook(ask).accept_all(seen, by=by)
+    done = ask.gradebook.accept_all(seen, by=by)
     message = f"{count(done.teams, 'team')} accepted."
     if done.kept:
         message += f" {count(len(done.kept), 'team')} changed meanwhile: look again."
@@ -66,7 +65,7 @@ def release(ask: PageRequest) -> Response:
             403, "only the instructor decides when students can read their feedback"
         )
     released = ask.text("do") == "release"
-    open_gradebook(ask).release(released, by=sign(ask))
+    ask.gradebook.release(released, by=ask.sign())
     message = "Students can read their feedback." if released else "Students can no longer read it."
     return ask.back(f"{ask.here}#work", message)
 
@@ -84,7 +83,7 @@ def export_class(ask: PageRequest) -> Response:
     with scratch_folder() as scratch:
         roster = _store_upload(ask, "roster", scratch / "roster.csv")
         out = scratch / "export"
-        book, title = open_gradebook(ask), ask.text("title") or None
+        book, title = ask.gradebook, ask.text("title") or None
         if what == "feedback":
             done = export_feedback(book, platform, out, roster=roster)
         else:
@@ -107,8 +106,8 @@ def export_class(ask: PageRequest) -> Response:
 
 def grade(ask: PageRequest) -> Response:
     """Grade the class again, or for the first time if an earlier attempt did not end."""
-    if open_gradebook(ask).is_graded:
-        anonymous, refuse = read_class(ask).rubric.anonymous, partial(show_class, ask)
+    if ask.gradebook.is_graded:
+        anonymous, refuse = ask.class_view.rubric.anonymous, partial(show_class, ask)
         return grade_again(ask, is_first=False, anonymous=anonymous, refuse=refuse)
     anonymous, refuse = bool(ask.text("anonymous")), partial(show_unfinished, ask)
     return grade_again(ask, is_first=True, anonymous=anonymous, refuse=refuse)

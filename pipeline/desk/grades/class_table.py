@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
-from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk.gradebooks import ClassView
@@ -17,8 +16,7 @@ from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing, show_own_page
 from pipeline.desk.users import name_place
 from pipeline.grading.grade import CODES
-from pipeline.grading.gradebook.events import TOTAL, Entry
-from pipeline.grading.gradebook.gradebook import Gradebook
+from pipeline.grading.gradebook.events import TOTAL
 from pipeline.grading.gradebook.history import to_the_second
 from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.class_page import class_page, not_final
@@ -35,8 +33,8 @@ from pipeline.report.html import render_drawing
 from pipeline.words.text import capital
 
 _ROWS = 50  # rows of one page
-_MOST_NEWS = 8
 _MOST_SETS = 20
+_MOST_NEWS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,29 +44,6 @@ class Counted:
     key: str
     title: str
     many: int
-
-
-def read_class(ask: PageRequest) -> ClassView:
-    """Return the class that the URL names."""
-    return ask.desk.gradebooks.of(ask.place_or_404())
-
-
-def open_gradebook(ask: PageRequest) -> Gradebook:
-    """Return the gradebook that the URL names."""
-    return ask.desk.gradebooks.gradebook(ask.place_or_404())
-
-
-def find_team(shown: ClassView, name: str) -> Entry:
-    """Return a team by its name as pages show it."""
-    team = shown.teams.get(name)
-    if team is None:
-        raise HTTPException(404, "no submission of this class has this name")
-    return team
-
-
-def find_signature(ask: PageRequest) -> str:
-    """Return the name with which a person's changes are signed; "" if it is not known yet."""
-    return ask.user.name or ask.desk.gradebooks.signed
 
 
 def may_release(ask: PageRequest) -> bool:
@@ -83,9 +58,9 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
     ----------
     form : the refused form to grade the class again.
     """
-    if isinstance(ask.place_or_404(), Path) and not open_gradebook(ask).is_graded:
+    if isinstance(ask.place_or_404(), Path) and not ask.gradebook.is_graded:
         return show_unfinished(ask)
-    shown, wanted = read_class(ask), Filter.read(ask.request.query_params)
+    shown, wanted = ask.class_view, Filter.read(ask.request.query_params)
     chosen = wanted.chosen(shown)
     pages = max(1, -(-len(chosen) // _ROWS))
     page = min(max(_read_number(ask, "page"), 1), pages)
@@ -108,7 +83,7 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
         clean=sum(not team.grade.in_doubt for team in unseen),
         flags=count_flags(shown),
         lost=count_lost(shown, titles),
-        sets=open_gradebook(ask).changed_together()[:_MOST_SETS],
+        sets=ask.gradebook.changed_together()[:_MOST_SETS],
         seen=sum(bool(team.reviewed_by) for team in shown.teams.values()),
         median=points_text(graded[len(graded) // 2]) if graded else "",
         out_of=points_text(shown.rubric.out_of),
@@ -121,8 +96,8 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
         drawn="-".join(map(str, shown.state)),
         news=list_news(ask, shown, since=shown.state[1]),
         form=form or fill_form(ask, named=shown.names is None),
-        n_requests=open_gradebook(ask).n_waiting(),
-        released=open_gradebook(ask).released,
+        n_requests=ask.gradebook.n_waiting(),
+        released=ask.gradebook.released,
         may_release=may_release(ask),
         platforms=PLATFORMS.values(),
     )
@@ -130,14 +105,14 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
 
 def show_clean(ask: PageRequest) -> Response:
     """Show the list of teams that can be accepted together: no remark, and not yet reviewed."""
-    shown = read_class(ask)
+    shown = ask.class_view
     return ask.page(
         "clean",
         title="Teams without a remark",
         teams=[one for one in Filter(seen="no").chosen(shown) if not one.grade.in_doubt],
         points=points_text,
         titles={asked.id: capital(asked.title or asked.id) for asked in shown.rubric.criteria},
-        signature=find_signature(ask),
+        signature=ask.signature,
     )
 
 
@@ -157,9 +132,13 @@ def count_lost(shown: ClassView, titles: Mapping[str, str]) -> list[Counted]:
 
 def show_news(ask: PageRequest) -> Response:
     """Show which points were changed since a page was loaded; empty if none were."""
-    shown = read_class(ask)
+    shown = ask.class_view
     since, latest = (_read_number(ask, name) for name in ("since", "told"))
-    answer = ask.page("news", title="", news=list_news(ask, shown, since=since))
+    answer = ask.page(
+        "news",
+        title="",
+        news=list_news(ask, shown, since=since),
+    )
     if shown.state[1] == latest:
         answer.headers["HX-Reswap"] = "none"
     return answer
@@ -177,7 +156,7 @@ def list_news(ask: PageRequest, shown: ClassView, *, since: int) -> dict[str, An
     if latest != since:
         of_name = {team.submission: name for name, team in shown.teams.items()}
         titles = {asked.id: asked.title for asked in shown.rubric.criteria}
-        for submission, override in open_gradebook(ask).changes_since(since):
+        for submission, override in ask.gradebook.changes_since(since):
             name = of_name.get(submission, STRANGER)
             points = "as graded" if override.points is None else points_text(override.points)
             points = "a comment" if override.what == "comment" else points
@@ -217,7 +196,7 @@ def _distribution(shown: ClassView) -> str:
 
 def show_class_page(ask: PageRequest) -> Response:
     """Show the class page of `cartlab grade`, made from the current gradebook."""
-    book = open_gradebook(ask)
+    book = ask.gradebook
 
     def draw(shown: ClassView) -> str:
         own = {entry.submission: entry for entry in shown.now.entries}
@@ -251,9 +230,9 @@ def show_class_page(ask: PageRequest) -> Response:
 
 def show_feedback(ask: PageRequest) -> Response:
     """Show the feedback that a team reads, in its current state."""
-    shown = read_class(ask)
-    team = find_team(shown, ask.request.path_params["name"])
-    book = open_gradebook(ask)
+    shown = ask.class_view
+    team = shown.team(ask.request.path_params["name"])
+    book = ask.gradebook
     entry = book.entry(team.submission)
     seen = view(entry, "staff", names=shown.names)
     page = feedback_page(seen, figures=book.figures(entry), name=seen.grade.submission)

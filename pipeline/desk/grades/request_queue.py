@@ -7,9 +7,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk.gradebooks import ClassView
-from pipeline.desk.grades.class_table import find_signature, find_team, open_gradebook, read_class
 from pipeline.desk.grades.criteria import list_steps
-from pipeline.desk.grades.team_page import sign
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.shown_criterion import describe_steps
 from pipeline.errors import ConfigError
@@ -29,10 +27,10 @@ def show(ask: PageRequest) -> Response:
 
 def act(ask: PageRequest) -> Response:
     """Answer a request or reopen it; if somebody else has answered it, show that answer."""
-    shown = read_class(ask)
-    team = find_team(shown, ask.text("team"))
-    book, name, what = open_gradebook(ask), team.submission, ask.text("do")
-    criterion, seen, by = ask.text("criterion"), ask.text("seen"), sign(ask)
+    shown = ask.class_view
+    team = shown.team(ask.text("team"))
+    book, name, what = ask.gradebook, team.submission, ask.text("do")
+    criterion, seen, by = ask.text("criterion"), ask.text("seen"), ask.sign()
     try:
         if what == "reopen":
             book.reopen(name, criterion, by=by, version=seen)
@@ -61,9 +59,9 @@ def _read_points(typed: str) -> float | None:
 
 
 def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Response:
-    shown, of = read_class(ask), ask.query("of")
-    book = open_gradebook(ask)
-    queue = book.queue(find_team(shown, of).submission if of else "")
+    shown, of = ask.class_view, ask.query("of")
+    book = ask.gradebook
+    queue = book.queue(shown.team(of).submission if of else "")
     called = {team.submission: name for name, team in shown.teams.items()}
     waiting, settled = (
         [
@@ -82,7 +80,7 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
         settled=settled,
         n_waiting=queue.n_waiting,
         n_settled=queue.n_settled,
-        signature=find_signature(ask),
+        signature=ask.signature,
         most=MOST_LETTERS,
         wrong="" if any(one["wrong"] for one in (*waiting, *settled)) else wrong,
     )
@@ -130,7 +128,7 @@ def _find_title(rubric: Rubric, criterion: str) -> str:
 def _show_conflict(ask: PageRequest, shown: ClassView, conflict: Conflict) -> Response:
     """Show the typed answer next to the current state; nothing was changed."""
     name, criterion = ask.text("team"), ask.text("criterion")
-    entry = open_gradebook(ask).entry(shown.teams[name].submission)
+    entry = ask.gradebook.entry(shown.teams[name].submission)
     own = next((c for c in entry.grade.criteria if c.id == criterion), None)
     points, request = points_text(own.points) if own else NOTHING, entry.requests.get(criterion)
     answered = request is not None and request.state == "answered"
@@ -141,7 +139,7 @@ def _show_conflict(ask: PageRequest, shown: ClassView, conflict: Conflict) -> Re
         "conflict",
         status=409,
         title=f"{name}: {_find_title(shown.rubric, criterion)}",
-        typed={"points": typed, "why": ask.text("text"), "by": find_signature(ask)},
+        typed={"points": typed, "why": ask.text("text"), "by": ask.signature},
         now={"points": points, "why": why, "by": by},
         back=_write_address(ask, ask.query("of")),
     )

@@ -14,13 +14,7 @@ from starlette.responses import Response
 
 from pipeline.desk import served_files
 from pipeline.desk.gradebooks import ClassView
-from pipeline.desk.grades.class_table import (
-    find_signature,
-    find_team,
-    list_news,
-    open_gradebook,
-    read_class,
-)
+from pipeline.desk.grades.class_table import list_news
 from pipeline.desk.grades.criteria import (
     Item,
     describe_criterion,
@@ -28,7 +22,7 @@ from pipeline.desk.grades.criteria import (
     list_items,
     show_figures,
 )
-from pipeline.desk.grades.grading_form import last_run, start_grading
+from pipeline.desk.grades.grading_form import start_grading
 from pipeline.desk.grades.review_order import Filter
 from pipeline.desk.jobs import Busy
 from pipeline.desk.last_report import PLOTS, PLOTS_OF
@@ -72,10 +66,10 @@ def show(ask: PageRequest) -> Response:
 
 def act(ask: PageRequest) -> Response:
     """Do what the pressed button says: sign, accept, unmark, change points, or undo."""
-    shown = read_class(ask)
-    team = find_team(shown, ask.query("of"))
-    book, name, what = open_gradebook(ask), team.submission, ask.text("do")
-    by = sign(ask)
+    shown = ask.class_view
+    team = shown.team(ask.query("of"))
+    book, name, what = ask.gradebook, team.submission, ask.text("do")
+    by = ask.sign()
     if what == "unsee":
         book.set_reviewed(name, by=by, reviewed=False)
     if what in ("sign", "unsee"):
@@ -169,8 +163,8 @@ def _show_repair(
 
 def show_figure(ask: PageRequest) -> Response:
     """Show one of a team's figures."""
-    team = find_team(read_class(ask), ask.query("of"))
-    book = open_gradebook(ask)
+    team = ask.class_view.team(ask.query("of"))
+    book = ask.gradebook
     drawn = dict(book.figures(book.entry(team.submission)))
     name = ask.query("figure")
     if name not in drawn:
@@ -180,9 +174,9 @@ def show_figure(ask: PageRequest) -> Response:
 
 def send_paper(ask: PageRequest) -> Response:
     """Send a PDF that a team submitted."""
-    shown = read_class(ask)
-    team = find_team(shown, ask.query("of"))
-    folder = _find_recordings(ask, shown, open_gradebook(ask).entry(team.submission))
+    shown = ask.class_view
+    team = shown.team(ask.query("of"))
+    folder = _find_recordings(ask, shown, ask.gradebook.entry(team.submission))
     name = ask.query("file")
     if folder is None or name not in _list_papers(folder):
         raise HTTPException(404, "there is no such file")
@@ -192,9 +186,9 @@ def send_paper(ask: PageRequest) -> Response:
 def _show_page(
     ask: PageRequest, *, wrong: str = "", wrong_repair: str = "", status: int = 200
 ) -> Response:
-    shown = read_class(ask)
-    team = find_team(shown, ask.query("of"))
-    book, name = open_gradebook(ask), team.grade.submission
+    shown = ask.class_view
+    team = shown.team(ask.query("of"))
+    book, name = ask.gradebook, team.grade.submission
     now, grade = team, team.grade
     _, events = book.history(team.submission, shown_as=name if now.rubric.anonymous else "")
     wanted = Filter.read(ask.request.query_params)
@@ -221,7 +215,7 @@ def _show_page(
         doubts=sum(item.doubt for item in items),
         events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
         news=list_news(ask, shown, since=shown.state[1]),
-        signature=find_signature(ask),
+        signature=ask.signature,
         repair=_show_repair(ask, shown, team, wrong=wrong_repair),
         requests={criterion: request.state for criterion, request in now.requests.items()},
         recordings=folder,
@@ -278,7 +272,7 @@ def _show_chosen(
     ask: PageRequest, shown: ClassView, grade: Grade, now: Entry, *, chosen: Item, wrong: str
 ) -> dict[str, Any]:
     """Return what is shown next to the list: the chosen criterion or flag, with its evidence."""
-    name, drawn = grade.submission, open_gradebook(ask).figures(now)
+    name, drawn = grade.submission, ask.gradebook.figures(now)
     asked = next((c for c in now.rubric.criteria if c.id == chosen.id), None)
     if chosen.is_remark or asked is None:
         asked, one, flags = None, None, [flag for flag in grade.flags if flag.code == chosen.id]
@@ -289,7 +283,7 @@ def _show_chosen(
         flags = find_remarks(grade, asked, now.rubric)
     own = next((c for c in grade.criteria if asked and c.id == asked.id), None)
     figures = show_figures(drawn, asked, own, first=ask.query("figure")) if asked else []
-    reasons = open_gradebook(ask).reasons().get(asked.id, [])[:30] if asked else []
+    reasons = ask.gradebook.reasons().get(asked.id, [])[:30] if asked else []
     return {
         "one": one,
         "chosen": chosen,
@@ -360,7 +354,7 @@ def _same_slip(shown: ClassView, flag: Flag, *, lost: str) -> tuple[Filter, str]
 
 def _show_conflict(ask: PageRequest, name: str, conflict: Conflict) -> Response:
     """Show what a person typed next to the current state; nothing was changed."""
-    now = find_team(read_class(ask), name)
+    now = ask.class_view.team(name)
     criterion = ask.text("criterion")
     titles = {asked.id: asked.title for asked in now.rubric.criteria}
     own = next((c for c in now.grade.criteria if c.id == criterion), None)
@@ -372,7 +366,7 @@ def _show_conflict(ask: PageRequest, name: str, conflict: Conflict) -> Response:
         typed={
             "points": "undo" if undoing else ask.text("other") or ask.text("points"),
             "why": ask.text("why"),
-            "by": find_signature(ask),
+            "by": ask.signature,
         },
         now={
             "points": points_text(own.points) if own else "not judged",
@@ -382,22 +376,6 @@ def _show_conflict(ask: PageRequest, name: str, conflict: Conflict) -> Response:
         # With a fragment, the browser would stay on this page without loading it again.
         back=write_address(ask, name, criterion=criterion),
     )
-
-
-def sign(ask: PageRequest) -> str:
-    """Return the name that signs a change: from the proxy, or typed once by the person.
-
-    Raises
-    ------
-    ConfigError : no name is known.
-    """
-    if ask.user.name:
-        return ask.user.name
-    typed = ask.text("by") or ask.desk.gradebooks.signed
-    if not typed:
-        raise ConfigError("enter your name first: every change by hand is signed")
-    ask.desk.gradebooks.signed = typed
-    return typed
 
 
 def write_address(ask: PageRequest, name: str, **more: str) -> str:
@@ -443,9 +421,9 @@ def _list_candidates(ask: PageRequest, name: str) -> Iterator[Path]:
     """Yield folders that may be the submission: open ones, graded ones, or near the gradebook."""
     place = ask.place_or_404()
     yield from (folder for folder in ask.user.folders if folder.name == name)
-    run = last_run(ask.user, place)
-    for path in run.paths if run else ():
-        yield from (Path(path), Path(path) / name)
     if isinstance(place, Path):
+        run = read_run(place)
+        for path in run.paths if run else ():
+            yield from (Path(path), Path(path) / name)
         yield place.parent / name
         yield from (beside / name for beside in sorted(place.parent.iterdir()))
