@@ -1,7 +1,6 @@
 """Give several teams the same points or comment: preview first, then change all or none."""
 
-from dataclasses import dataclass
-from typing import Any
+from functools import partial
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from starlette.exceptions import HTTPException
@@ -24,32 +23,6 @@ from pipeline.words.text import capital, with_symbols
 
 _SAME = "same"  # value of the choice to leave points unchanged and only comment
 _DONE = "bulk_change"  # part of a page where the result is reported
-
-
-@dataclass(frozen=True, kw_only=True)
-class TeamRow:
-    """A team in the list, now and after the change.
-
-    Attributes
-    ----------
-    ticked : whether the team will be changed.
-    version : version of the criterion's points, which is sent along with the change.
-    moved : whether somebody has changed the points since the list was shown.
-    now, after : points of the criterion before and after the change.
-    total_now, total_after : points of the submission before and after the change.
-    message : the current message of the criterion.
-    """
-
-    name: str
-    address: str
-    ticked: bool
-    version: str
-    moved: bool
-    now: str
-    after: str
-    total_now: str
-    total_after: str
-    message: str
 
 
 def show(ask: PageRequest) -> Response:
@@ -161,7 +134,8 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
         wrong, status = wrong or f"{capital(str(error))}.", 422
         rows = _list_rows(ask, shown, asked, typed=_SAME)
     steps = list_steps(asked.points, shown.rubric)
-    team = ask.query("of")
+    versions = {name: now.version(asked.id) for name, now, _ in rows}
+    team, sent = ask.query("of"), ask.sent.getlist("team")
     return ask.page(
         "bulk_change",
         status=status,
@@ -177,13 +151,36 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
         why=ask.text("why"),
         usual=next(iter(ask.gradebook.reasons().get(asked.id, [])), ""),
         rows=rows,
-        ticked=sum(row.ticked for row in rows),
+        earned=partial(_earned, asked),
+        message=partial(_message, asked),
+        versions=versions,
+        ticked=[name for name in versions if name in sent or ask.text("listed") != "1"],
+        moved=[name for name in versions if _is_moved(ask, name, versions[name])],
+        address=partial(write_address, ask, criterion=asked.id),
         wrong=wrong,
         signature=ask.signature,
         back=_back(ask, team, asked) if team in shown.teams else f"{ask.here}?{wanted.query}",
         team=team if team in shown.teams else "",
         wider=_widen(ask, shown, wanted),
     )
+
+
+def _earned(asked: Criterion, entry: Entry) -> str:
+    """Return the points of a criterion as text."""
+    found = (points_text(c.points) for c in entry.grade.criteria if c.id == asked.id)
+    return next(found, "not judged")
+
+
+def _message(asked: Criterion, entry: Entry) -> str:
+    """Return the message of a criterion to the team."""
+    found = (sentence(c.message) for c in entry.grade.criteria if c.id == asked.id)
+    return with_symbols(next(found, ""))
+
+
+def _is_moved(ask: PageRequest, name: str, version: str) -> bool:
+    """Return whether somebody has changed a team's points since the list was shown."""
+    sent = ask.text(f"seen.{name}")
+    return ask.request.method == "POST" and sent not in ("", version)
 
 
 def _back(ask: PageRequest, team: str, asked: Criterion) -> str:
@@ -215,8 +212,8 @@ def _widen(ask: PageRequest, shown: ClassView, wanted: Filter) -> tuple[str, int
 
 def _list_rows(
     ask: PageRequest, shown: ClassView, asked: Criterion, *, typed: str
-) -> list[TeamRow]:
-    """Return the teams that pass the filter or were in the form, with points before and after."""
+) -> list[tuple[str, Entry, Entry]]:
+    """Return the teams that pass the filter or were in the form, before and after the change."""
     sent = ask.sent.getlist("team")
     names = [team.grade.submission for team in Filter.read(ask.request.query_params).chosen(shown)]
     names += [str(name) for name in sent if name in shown.teams and name not in names]
@@ -226,33 +223,5 @@ def _list_rows(
         names = [name for name in names if asked.id in shown.teams[name].grade.judged]
     wishes = [_wish(ask, shown, asked, name, typed=typed) for name in names]
     tried = {both[0].submission: both for both in ask.gradebook.preview_all(wishes)}
-    began = ask.text("listed") == "1"
-    rows = []
-    for name in names:
-        if both := tried.get(shown.teams[name].submission):
-            ticked = name in sent if began else True
-            rows.append(_row(ask, name, *both, asked=asked, ticked=ticked))
-    return rows
-
-
-def _row(
-    ask: PageRequest, name: str, now: Entry, after: Entry, *, asked: Criterion, ticked: bool
-) -> TeamRow:
-    def own(grade: Any) -> str:
-        found = (points_text(c.points) for c in grade.criteria if c.id == asked.id)
-        return next(found, "not judged")
-
-    sent, version = ask.text(f"seen.{name}"), now.version(asked.id)
-    messages = (sentence(c.message) for c in now.grade.criteria if c.id == asked.id)
-    return TeamRow(
-        name=name,
-        address=write_address(ask, name, criterion=asked.id),
-        ticked=ticked,
-        version=version,
-        moved=ask.request.method == "POST" and bool(sent) and sent != version,
-        now=own(now.grade),
-        after=own(after.grade),
-        total_now=points_text(now.grade.points),
-        total_after=points_text(after.grade.points),
-        message=with_symbols(next(messages, "")),
-    )
+    own = ((name, tried.get(shown.teams[name].submission)) for name in names)
+    return [(name, *both) for name, both in own if both]
