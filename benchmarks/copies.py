@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.grading.gradings import Member
+from pipeline.grading.gradings import Grading
 from pipeline.grading.similarity.copies import find_copies
 from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.results import Record
@@ -99,11 +99,11 @@ def disguised(
     return made
 
 
-def member(name: str, team: Team) -> Member:
-    return Member(submission=name, authors=(f"s-{name}",), fingerprints=fingerprint(team))
+def member(name: str, team: Team) -> Grading:
+    return Grading(submission=name, authors=(f"s-{name}",), fingerprints=fingerprint(team))
 
 
-def honest_class(cache: Path, number: int, *, seed: int, classes: int) -> list[Member]:
+def honest_class(cache: Path, number: int, *, seed: int, classes: int) -> list[Grading]:
     """Return a class of honest teams; every third one mixes the teams of several benches."""
     noise, count = READ[number % len(READ)]
     at = number % classes

@@ -25,7 +25,7 @@ from benchmarks.copies import disguised
 from benchmarks.grading_batch import grade, write_class
 from benchmarks.page import significant
 from pipeline.grading.batch.worker import grade_hand_in
-from pipeline.grading.gradings import HandIn, Member
+from pipeline.grading.gradings import Grading, HandIn
 from pipeline.grading.intake.files import packed
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.copies import find_copies
@@ -87,7 +87,7 @@ def measure(*, teams: int) -> dict[str, Any]:
             other = disguised(own, own, rng, noise=20.0)
             name = str(number)
             members.append(
-                Member(submission=name, authors=(name,), fingerprints=fingerprint(other))
+                Grading(submission=name, authors=(name,), fingerprints=fingerprint(other))
             )
         start = time.process_time()
         find_copies(members)

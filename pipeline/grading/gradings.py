@@ -6,7 +6,7 @@ Importing this module loads no code that grades.
 import base64
 import unicodedata
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +28,7 @@ class HandIn:
     handed_in : time of the hand-in in ISO 8601, or "" if the platform does not give it.
     problem : why the files cannot be opened, if this is already known; or "".
     parent : name of the parent folder, which may be used to make the id unique.
-    key : hash of everything that affects the outcome; see `Member`.
+    key : hash of everything that affects the outcome; see `Grading`.
     digest : expected hash of the submitted files; "" to skip this check.
     repairs : see `intake.repairs.read_repairs`.
     """
@@ -55,14 +55,13 @@ class HandIn:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Member:
-    """A submission of a class: its owner and the fingerprints of its recordings.
+class Grading:
+    """The result of grading one submission, before it is compared with the others.
 
     Attributes
     ----------
     submission : id of the submission, unique in the batch.
-    owner : account on the learning platform that submitted the files, such as "Jane Doe (moodle
-        1024)", or "".
+    owner : account on the learning platform that submitted the files; see `HandIn`.
     key : hash of everything that affects the grade (submitted files, rubric, code, name and
         lateness), a hyphen, and the hash of the files alone.
     fingerprints : noise patterns of the recordings, by which copies are found; see
@@ -70,6 +69,14 @@ class Member:
     reason : why the submission could not be graded, one cause per line, or "".
     grading : number of the grading in the gradebook.
     of_class : whether the submission belongs to the assignment that is being graded.
+    settled : False if the next run must grade the submission again, for example after a crash.
+    grade : text of `grade.json`, without the flag for shared data and without overrides.
+    findings : results of the checks, from `judge.award.findings_text`; "" if grading failed.
+    figures : file name and SVG text of each figure in the feedback.
+    detail : for developers: the traceback of an error in the grader, or "".
+    is_disk_full : whether the disk was full; the gradebook does not store this.
+    original : text of `submission.toml` as handed in, if it has a mistake or was repaired; else "".
+        The gradebook does not store this.
     """
 
     submission: str
@@ -80,6 +87,15 @@ class Member:
     reason: str = ""
     grading: int = 0
     of_class: bool = False
+    status: Literal["graded", "failed"] = "graded"
+    settled: bool = True
+    days_late: float = 0.0
+    grade: str = ""
+    findings: str = ""
+    figures: tuple[tuple[str, str], ...] = ()
+    detail: str = ""
+    is_disk_full: bool = False
+    original: str = ""
 
     @cached_property
     def people(self) -> set[str]:
@@ -90,6 +106,10 @@ class Member:
     def content(self) -> str:
         """The part of the key that depends only on the files, or ""."""
         return self.key.partition("-")[2]
+
+    def without_texts(self) -> "Grading":
+        """Return what a batch keeps in memory; the gradebook stores the whole grading."""
+        return replace(self, grade="", findings="", figures=(), detail="", original="")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,38 +124,6 @@ class Example:
 
     fingerprints: bytes = field(repr=False)
     numbers: frozenset[tuple[str, float]] = frozenset()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Grading(Member):
-    """The result of grading one submission, before it is compared with the others.
-
-    Attributes
-    ----------
-    settled : False if the next run must grade the submission again, for example after a crash.
-    grade : text of `grade.json`, without the flag for shared data and without overrides.
-    findings : results of the checks, from `judge.award.findings_text`; "" if grading failed.
-    figures : file name and SVG text of each figure in the feedback.
-    detail : for developers: the traceback of an error in the grader, or "".
-    is_disk_full : whether the disk was full; the gradebook does not store this.
-    original : text of `submission.toml` as handed in, if it has a mistake or was repaired; else "".
-        The gradebook does not store this.
-    """
-
-    status: Literal["graded", "failed"]
-    settled: bool = True
-    days_late: float = 0.0
-    grade: str
-    findings: str = ""
-    figures: tuple[tuple[str, str], ...] = ()
-    detail: str = ""
-    is_disk_full: bool = False
-    original: str = ""
-
-    @property
-    def member(self) -> Member:
-        """The part that a batch keeps in memory; the gradebook stores the whole grading."""
-        return Member(**{own.name: getattr(self, own.name) for own in fields(Member)})
 
 
 def person(author: str) -> str:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.grading.gradings import Member
+from pipeline.grading.gradings import Grading
 from pipeline.grading.similarity.copies import find_copies
 from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.ingest.read import read_data
@@ -26,7 +26,7 @@ SAMPLE = {
 
 
 def member(name, records):
-    return Member(submission=name, authors=(f"s-{name}",), fingerprints=fingerprint(records))
+    return Grading(submission=name, authors=(f"s-{name}",), fingerprints=fingerprint(records))
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,6 @@ from pipeline.grading.gradings import (
     Example,
     Grading,
     HandIn,
-    Member,
     Setup,
     failed,
     read_grading,
@@ -74,7 +73,7 @@ def grade_batch(
     progress(len(rows), total, "")
     for outcome in execute(new, setup) if new else ():
         book.put(outcome)
-        rows[outcome.submission] = outcome.member
+        rows[outcome.submission] = outcome.without_texts()
         if setup.out and (outcome.original or (setup.out / FOLDER).is_dir()):
             keep_original(setup.out, outcome.submission, outcome.original)
         if outcome.status == "failed" and not outcome.settled:
@@ -100,7 +99,7 @@ def grade_batch(
 
 def _known_and_new(
     hand_ins: Sequence[HandIn], *, setup: Setup, book: Gradebook
-) -> tuple[dict[str, Member], list[HandIn]]:
+) -> tuple[dict[str, Grading], list[HandIn]]:
     """Return the known outcomes by submission, and the hand-ins that must be graded.
 
     A hand-in that cannot be opened is stored as failed and counts as known.
@@ -117,7 +116,7 @@ def _known_and_new(
         if outcome is None or not outcome.settled:
             new.append(hand_in)
         else:
-            rows[hand_in.id] = outcome.member
+            rows[hand_in.id] = outcome.without_texts()
     return rows, new
 
 
@@ -268,7 +267,7 @@ def _with_key(
 
 
 def _shared(
-    rows: Sequence[Member],
+    rows: Sequence[Grading],
     book: Gradebook,
     *,
     rubric: Rubric,
@@ -304,12 +303,12 @@ def _shared(
     }
 
 
-def _typed_numbers(row: Member, book: Gradebook, *, rubric: Rubric) -> dict[Key, TypedNumber]:
+def _typed_numbers(row: Grading, book: Gradebook, *, rubric: Rubric) -> dict[Key, TypedNumber]:
     known = book.known(row.key, figures=False)
     return typed_numbers(read_grade(known.grade), rubric=rubric) if known else {}
 
 
-def _is_earlier_version(earlier: Member, now: Member | None) -> bool:
+def _is_earlier_version(earlier: Grading, now: Grading | None) -> bool:
     """Return whether `earlier` is an earlier version of the submission `now`.
 
     This is true if both are from the same team. Within one assignment, equal recordings are enough,
@@ -332,15 +331,15 @@ class ClassChanges:
         the authors now. Points given by hand do not pass to the new authors.
     """
 
-    kept: Mapping[str, Member]
+    kept: Mapping[str, Grading]
     moved: Mapping[str, str]
     taken_over: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...]
 
 
-def find_class_changes(rows: Mapping[str, Member], book: Gradebook) -> ClassChanges:
+def find_class_changes(rows: Mapping[str, Grading], book: Gradebook) -> ClassChanges:
     """Return how a run changes the current class list; `rows` are the run's submissions by name."""
     now = {name.casefold(): name for name in rows}
-    left: dict[str, Member] = {}
+    left: dict[str, Grading] = {}
     new, moved = dict(rows), {}
     lines = list(book.listed())
     for line in lines:
@@ -367,16 +366,16 @@ def find_class_changes(rows: Mapping[str, Member], book: Gradebook) -> ClassChan
     )
 
 
-def _is_other_team(before: Member, now: Member) -> bool:
+def _is_other_team(before: Grading, now: Grading) -> bool:
     """Return whether a submission now has another team; False if authors are unknown."""
     return _has_only_new_authors(before, now) and not same_number(before.owner, now.owner)
 
 
-def _has_only_new_authors(before: Member, now: Member) -> bool:
+def _has_only_new_authors(before: Grading, now: Grading) -> bool:
     return bool(before.people and now.people) and before.people.isdisjoint(now.people)
 
 
-def _match_renamed(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[str, str]:
+def _match_renamed(before: Mapping[str, Grading], now: Mapping[str, Grading]) -> dict[str, str]:
     """Return the new name of each renamed submission.
 
     The pairs with the strongest evidence are matched first.
@@ -394,7 +393,7 @@ def _match_renamed(before: Mapping[str, Member], now: Mapping[str, Member]) -> d
     return moved
 
 
-def _evidence(before: Member, now: Member) -> tuple[bool, ...]:
+def _evidence(before: Grading, now: Grading) -> tuple[bool, ...]:
     """Return, for each kind of evidence, whether it shows that both submissions are the same.
 
     The strongest kind comes first. The result is empty if the teams differ.

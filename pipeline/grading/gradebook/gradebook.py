@@ -52,7 +52,7 @@ from pipeline.grading.gradebook.rows import (
     read_events,
     read_figures,
     read_flag,
-    read_members,
+    read_gradings,
     read_prints,
     read_rubric,
 )
@@ -65,7 +65,7 @@ from pipeline.grading.gradebook.schema import (
     gradings,
     submissions,
 )
-from pipeline.grading.gradings import Batch, Grading, Member, person
+from pipeline.grading.gradings import Batch, Grading, person
 from pipeline.grading.rubric import Rubric
 from pipeline.submission.toml import nearest
 from pipeline.words.progress import silent
@@ -228,7 +228,7 @@ class Gradebook:
                 kept = {"grading_id": number, "found": grading.findings}
                 add_row(connection, findings, kept)
 
-    def fingerprints(self, numbers: Sequence[int] | None = None) -> Iterator[Member]:
+    def fingerprints(self, numbers: Sequence[int] | None = None) -> Iterator[Grading]:
         """Return all submissions with the fingerprints of their recordings, without repetitions.
 
         Earlier versions of submissions are included, because their recordings may have been passed
@@ -241,7 +241,7 @@ class Gradebook:
         """
         return read_prints(self._database, numbers, assignment=self._assignment or "")
 
-    def listed(self) -> Iterator[Member]:
+    def listed(self) -> Iterator[Grading]:
         """Yield the submissions of the current class list, without fingerprints.
 
         The list is empty until a batch is complete.
@@ -249,7 +249,7 @@ class Gradebook:
         with self._database.reading() as connection:
             last = self._newest(connection)
             lines = [] if last is None else lines_of(connection, last)
-        return read_members(self._database, [line["grading_id"] for line in lines])
+        return read_gradings(self._database, [line["grading_id"] for line in lines])
 
     def days_late(self) -> dict[str, float]:
         """Return the days late of each submission on the current class list.

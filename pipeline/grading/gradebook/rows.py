@@ -35,7 +35,7 @@ from pipeline.grading.gradebook.schema import (
     gradings,
     submissions,
 )
-from pipeline.grading.gradings import Grading, Member, same_people
+from pipeline.grading.gradings import Grading, same_people
 from pipeline.grading.rubric import Rubric
 
 _PAGE = 100  # rows read at once; few, so that memory use stays flat and writers wait only briefly
@@ -47,7 +47,7 @@ _EVENT = [
     if f.name != "out_of"
 ]
 _OF_GRADING = select(submissions.c.name.label("submission"), *(gradings.c[x] for x in GRADING))
-_MEMBER = (
+_BRIEF = (
     submissions.c.name.label("submission"),
     gradings.c.authors,
     gradings.c.owner,
@@ -101,18 +101,18 @@ def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str],
     return tuple((name, svg) for name, svg in connection.execute(mine.order_by(figures.c.position)))
 
 
-def read_members(database: Database, numbers: Sequence[int]) -> Iterator[Member]:
-    """Yield the gradings with these numbers as class members, without fingerprints."""
-    lines = select(*_MEMBER).join(submissions).order_by(gradings.c.id)
+def read_gradings(database: Database, numbers: Sequence[int]) -> Iterator[Grading]:
+    """Yield the gradings with these numbers, without texts and fingerprints."""
+    lines = select(*_BRIEF).join(submissions).order_by(gradings.c.id)
     for page in pages(numbers):
         with database.reading() as connection:
             rows = connection.execute(lines.where(gradings.c.id.in_(page))).mappings().all()
-        yield from (Member(**row, of_class=True) for row in rows)
+        yield from (Grading(**row, of_class=True) for row in rows)
 
 
 def read_prints(
     database: Database, numbers: Sequence[int] | None = None, *, assignment: str
-) -> Iterator[Member]:
+) -> Iterator[Grading]:
     """Yield all submissions with the fingerprints of their recordings, without repetitions.
 
     Parameters
@@ -120,7 +120,7 @@ def read_prints(
     numbers : numbers of the gradings to read; default: all gradings that have fingerprints.
     assignment : assignment whose submissions have `of_class` set.
     """
-    chosen = select(*_MEMBER, gradings.c.fingerprints, submissions.c.assignment)
+    chosen = select(*_BRIEF, gradings.c.fingerprints, submissions.c.assignment)
     chosen = chosen.join(submissions).order_by(gradings.c.id)
     if numbers is None:
         chosen = chosen.where(gradings.c.fingerprints != b"")
@@ -132,7 +132,7 @@ def read_prints(
             rows = connection.execute(chosen.where(gradings.c.id.in_(page))).mappings().all()
         for row in map(dict, rows):
             of = row.pop("assignment")
-            one = Member(**row, of_class=of == assignment)
+            one = Grading(**row, of_class=of == assignment)
             own = of, one.submission, one.authors, hashlib.sha256(one.fingerprints).digest()
             if own not in seen:
                 seen.add(own)

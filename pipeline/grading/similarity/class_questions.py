@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradings import Member, person
+from pipeline.grading.gradings import Grading, person
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.copies import find_copies
 from pipeline.names import read_name
@@ -75,7 +75,7 @@ def find_repeated_authors(authors: Mapping[str, Sequence[str]]) -> list[Repeated
 
 
 def with_recordings(
-    repeated: Iterable[RepeatedAuthors], members: Iterable[Member]
+    repeated: Iterable[RepeatedAuthors], members: Iterable[Grading]
 ) -> list[RepeatedAuthors]:
     """Return the people with the number of recordings that their submissions share.
 

@@ -14,7 +14,7 @@ from itertools import zip_longest
 
 import numpy as np
 
-from pipeline.grading.gradings import Member
+from pipeline.grading.gradings import Grading
 from pipeline.grading.platforms import same_number
 from pipeline.grading.similarity.fingerprints import PASSED, Fingerprint, unpack
 from pipeline.grading.similarity.noise import (
@@ -93,9 +93,9 @@ class _Owned:
 
 
 def find_copies(
-    batch: Sequence[Member],
+    batch: Sequence[Grading],
     *,
-    earlier: Iterable[Member] = (),
+    earlier: Iterable[Grading] = (),
     examples: Iterable[bytes] = (),
 ) -> dict[str, tuple[SharedRecord, ...]]:
     """Return, for each submission of the batch, the recordings that it shares with others.
@@ -113,7 +113,7 @@ def find_copies(
     ]
     owners = [
         *everyone,
-        *(Member(submission="", authors=(), fingerprints=packed) for packed in examples),
+        *(Grading(submission="", authors=(), fingerprints=packed) for packed in examples),
     ]
     groups = _by_group(owners)
     equal: dict[tuple[int, int], list[Match]] = defaultdict(list)
@@ -150,7 +150,7 @@ def find_copies(
     }
 
 
-def _by_group(owners: Iterable[Member]) -> dict[str, list[_Owned]]:
+def _by_group(owners: Iterable[Grading]) -> dict[str, list[_Owned]]:
     """Group fingerprints that may come from the same recording, without duplicates of one owner."""
     groups: dict[str, list[_Owned]] = defaultdict(list)
     for owner, prints in enumerate(owners):
@@ -176,7 +176,7 @@ def _record_of(one: Match, mine: int, other: int, *, submission: str) -> SharedR
     )
 
 
-def same_team(a: Member, b: Member) -> bool:
+def same_team(a: Grading, b: Grading) -> bool:
     """Return whether two submissions are from the same team.
 
     They are from the same team if they have an author or an account number in common. If one of
@@ -189,7 +189,7 @@ def same_team(a: Member, b: Member) -> bool:
     return a.submission == b.submission
 
 
-def same_recordings(a: Member, b: Member) -> bool:
+def same_recordings(a: Grading, b: Grading) -> bool:
     """Return whether one of two submissions contains all recordings of the other, unchanged."""
     of_a, of_b = ({one.residual.tobytes() for one in unpack(p.fingerprints)} for p in (a, b))
     return bool(of_a and of_b) and (of_a <= of_b or of_b <= of_a)
@@ -221,7 +221,7 @@ class _Pairs:
         self,
         groups: Mapping[str, Sequence[_Owned]],
         *,
-        everyone: Sequence[Member],
+        everyone: Sequence[Grading],
         first_batch: int,
     ):
         self._everyone = everyone
@@ -341,7 +341,7 @@ def _equal(
     *,
     first_batch: int,
     everyone: int,
-    owners: Sequence[Member],
+    owners: Sequence[Grading],
     total: dict[tuple[int, int], float],
 ) -> Iterator[tuple[tuple[int, int], Match]]:
     """Yield pairs of recordings with equal rows from different teams, each with its two owners.

@@ -15,7 +15,7 @@ from decimal import Decimal
 import numpy as np
 
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradings import Member
+from pipeline.grading.gradings import Grading
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.copies import same_team
 from pipeline.names import read_name
@@ -104,7 +104,7 @@ def typed_numbers(grade: Grade, *, rubric: Rubric) -> dict[Key, TypedNumber]:
 
 
 def find_shared_tables(
-    batch: Sequence[Member],
+    batch: Sequence[Grading],
     reported: Mapping[str, Mapping[Key, TypedNumber]],
     *,
     given: Collection[tuple[str, float]] = (),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.gradings import Member
+from pipeline.grading.gradings import Grading
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.similarity.class_questions import (
     RepeatedAuthors,
@@ -67,7 +67,7 @@ def test_without_names_nobody_is_named(recordings, tmp_path):
 def test_each_common_recording_is_counted_once(recordings):
     """If four submissions have the same recordings, each recording is counted once."""
     prints = [
-        Member(submission=f"t{i}", authors=("s1",), fingerprints=recordings[0]) for i in range(4)
+        Grading(submission=f"t{i}", authors=("s1",), fingerprints=recordings[0]) for i in range(4)
     ]
     counted = []
     for some in (prints[:2], prints):
@@ -80,7 +80,7 @@ def test_a_submission_without_fingerprints_was_not_compared(recordings):
     """If a submission has no fingerprints, the message says that it could not be compared."""
     for left, compared in ((b"", False), (recordings[1], True)):
         prints = [
-            Member(submission=name, authors=("s1",), fingerprints=kept)
+            Grading(submission=name, authors=("s1",), fingerprints=kept)
             for name, kept in (("a", recordings[0]), ("b", left))
         ]
         (double,) = with_recordings(find_repeated_authors({"a": ("s1",), "b": ("s1",)}), prints)

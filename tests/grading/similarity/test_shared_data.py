@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.grading.gradings import Member
+from pipeline.grading.gradings import Grading
 from pipeline.grading.similarity import copies
 from pipeline.grading.similarity.copies import find_copies, same_recordings
 from pipeline.grading.similarity.fingerprints import fingerprint, unpack
@@ -44,7 +44,7 @@ def others(teams):
 
 def prints(name, records, authors=None):
     authors = authors or (f"s-{name}",)
-    return Member(submission=name, authors=authors, fingerprints=fingerprint(records))
+    return Grading(submission=name, authors=authors, fingerprints=fingerprint(records))
 
 
 def class_of(teams):
@@ -404,7 +404,7 @@ def test_fingerprints_of_an_older_version_are_not_compared(teams):
     head = {"experiment": "step-1", "group": "step 1,2 ", "shape": [2, 3], "step": [1, 1]}
     old = zlib.compress(json.dumps([head | {"anchors": [], "swing": []}]).encode() + bytes(7))
     assert unpack(old) == ()
-    before = Member(submission="a", authors=("ann",), fingerprints=old)
+    before = Grading(submission="a", authors=("ann",), fingerprints=old)
     assert not same_recordings(before, prints("a", teams[0][:1]))
     assert find_copies([prints("a", teams[0][:1])], earlier=[before]) == {}
 

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.grading.batch.runner import grade_batch
 from pipeline.grading.gradebook.gradebook import Gradebook
-from pipeline.grading.gradings import Example, Member, Setup
+from pipeline.grading.gradings import Example, Grading, Setup
 from pipeline.grading.intake.find import find_hand_ins
 from pipeline.grading.publish.pseudonyms import anonymise
 from pipeline.grading.similarity.copies import SharedRecord
@@ -62,7 +62,7 @@ def copied(mine, other, *, keep=()):
 
 
 def members(names, **authors):
-    return [Member(submission=n, authors=(authors.get(n, f"s-{n}"),)) for n in names]
+    return [Grading(submission=n, authors=(authors.get(n, f"s-{n}"),)) for n in names]
 
 
 def shared(numbers, **authors):
