@@ -7,6 +7,10 @@ from fractions import Fraction
 from pipeline.grading.grade import Criterion, Grade
 from pipeline.grading.rubric import Late, Rubric
 from pipeline.grading.tolerance import exact
+from pipeline.grading.words import points_text
+
+_MOST_STEPS = 9  # one for each key of a page, from 1 to 9
+_QUARTERS = 4
 
 
 def to_step(points: Fraction, step: float) -> Fraction:
@@ -42,3 +46,21 @@ def late_deduction(earned: Fraction, *, late: Late, step: float, days_late: floa
     days = max(0, math.ceil(days_late - late.grace_days))
     share = min(exact(late.percent_per_day) * days, exact(late.most_percent)) / 100
     return -to_step(-earned * share, step)
+
+
+def point_steps(out_of: float, *, step: float) -> list[float]:
+    """Return up to nine choices of points from 0 to `out_of`, one for each key from 1 to 9.
+
+    These are the multiples of the rubric's step. If those are too many, they are the quarters of
+    `out_of`, rounded to a step.
+    """
+    whole = exact(out_of)
+    fine = [n * exact(step) for n in range(_MOST_STEPS) if n * exact(step) < whole]
+    if (len(fine)) * exact(step) < whole:
+        fine = [to_step(whole * n / _QUARTERS, step) for n in range(_QUARTERS)]
+    return [float(points) for points in dict.fromkeys([*fine, whole])]
+
+
+def list_steps(out_of: float, rubric: Rubric) -> list[str]:
+    """Return the points of `point_steps` as text."""
+    return [points_text(points) for points in point_steps(out_of, step=rubric.step)]

@@ -14,7 +14,6 @@ from urllib.parse import quote, urlencode, urlsplit
 import pytest
 
 from pipeline.desk.app import DeskServer
-from pipeline.desk.grades.criteria import point_steps
 from pipeline.grading.grade import Flag
 from pipeline.grading.gradebook.events import Event
 from pipeline.grading.gradebook.gradebook import Gradebook
@@ -23,6 +22,7 @@ from pipeline.grading.intake.repairs import Run, read_run, save_run
 from pipeline.grading.platforms import PLATFORMS
 from pipeline.grading.publish.export import export, export_feedback
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.total import point_steps
 from pipeline.resources import RUBRICS
 from pipeline.words.text import capital
 from tests.helpers.commandline import cartlab_here

@@ -7,7 +7,6 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk.gradebooks import ClassView
-from pipeline.desk.grades.criteria import list_steps
 from pipeline.desk.grades.review_order import Filter
 from pipeline.desk.grades.team_page import write_address
 from pipeline.desk.page_request import PageRequest
@@ -17,6 +16,7 @@ from pipeline.grading.gradebook.events import Entry
 from pipeline.grading.publish.feedback import sentence
 from pipeline.grading.publish.pseudonyms import STRANGER
 from pipeline.grading.rubric import Criterion
+from pipeline.grading.total import list_steps
 from pipeline.grading.words import WORDS, points_text
 from pipeline.words.numbers import count
 from pipeline.words.text import capital, with_symbols

@@ -7,7 +7,6 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk.gradebooks import ClassView
-from pipeline.desk.grades.criteria import list_steps
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.shown_criterion import describe_steps
 from pipeline.errors import ConfigError
@@ -15,6 +14,7 @@ from pipeline.grading.gradebook.decisions import MOST_LETTERS, Conflict, Request
 from pipeline.grading.gradebook.events import Entry, Request
 from pipeline.grading.publish.feedback import sentence
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.total import list_steps
 from pipeline.grading.words import points_text
 from pipeline.words.numbers import NOTHING
 from pipeline.words.text import capital, with_symbols

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 from sqlalchemy import Connection, Row, func, select
 
 from pipeline.errors import ConfigError
-from pipeline.grading.class_frame import class_frame
-from pipeline.grading.grade import Grade, read_grade
+from pipeline.grading.grade import Grade, class_frame, read_grade
 from pipeline.grading.gradebook import decisions
 from pipeline.grading.gradebook.database import Database
 from pipeline.grading.gradebook.decisions import Conflict, RequestRefused, WantedPoints

@@ -10,8 +10,7 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline import __version__
-from pipeline.grading.class_frame import class_frame
-from pipeline.grading.grade import CODES, Code, Grade
+from pipeline.grading.grade import CODES, Code, Grade, class_frame
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.class_questions import Distant, RepeatedAuthors
 from pipeline.grading.similarity.shared_flag import Cluster
