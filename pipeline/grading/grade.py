@@ -141,6 +141,10 @@ class Grade(GradeTable):
         Field(description="criteria that a person has not graded yet; if any, points may rise"),
     ] = ()
 
+    def criterion(self, id_: str) -> Criterion | None:
+        """Return the result of a criterion; None if it was not judged."""
+        return next((own for own in self.criteria if own.id == id_), None)
+
     @property
     def judged(self) -> dict[str, Criterion]:
         """The results of the criteria, by id, without those that a person has yet to grade."""

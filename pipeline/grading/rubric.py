@@ -334,6 +334,15 @@ class Rubric(TomlTable):
     criteria: tuple[Criterion, ...]
 
     @property
+    def titles(self) -> dict[str, str]:
+        """The titles of the criteria, by id; the id if a criterion has none."""
+        return {asked.id: asked.title or asked.id for asked in self.criteria}
+
+    def criterion(self, id_: str) -> Criterion | None:
+        """Return a criterion; None if the rubric has none of this id."""
+        return next((asked for asked in self.criteria if asked.id == id_), None)
+
+    @property
     def names(self) -> list[str]:
         """The parameter names of the system, in the order of the tables in Throne's paper."""
         return parameter_names(self.system.carts, rigid=self.system.bench.rigid)

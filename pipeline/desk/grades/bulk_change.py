@@ -85,10 +85,10 @@ def _address(ask: PageRequest, *, done: str) -> str:
 
 def _find_criterion(ask: PageRequest, shown: ClassView) -> Criterion:
     """Return the criterion that the URL names."""
-    for asked in shown.rubric.criteria:
-        if asked.id == ask.query("criterion"):
-            return asked
-    raise HTTPException(404, "the rubric has no such criterion")
+    asked = shown.rubric.criterion(ask.query("criterion"))
+    if asked is None:
+        raise HTTPException(404, "the rubric has no such criterion")
+    return asked
 
 
 def _read_typed(ask: PageRequest) -> str:
@@ -167,14 +167,14 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
 
 def _earned(asked: Criterion, entry: Entry) -> str:
     """Return the points of a criterion as text."""
-    found = (points_text(c.points) for c in entry.grade.criteria if c.id == asked.id)
-    return next(found, "not judged")
+    own = entry.grade.criterion(asked.id)
+    return points_text(own.points) if own else "not judged"
 
 
 def _message(asked: Criterion, entry: Entry) -> str:
     """Return the message of a criterion to the team."""
-    found = (sentence(c.message) for c in entry.grade.criteria if c.id == asked.id)
-    return with_symbols(next(found, ""))
+    own = entry.grade.criterion(asked.id)
+    return with_symbols(sentence(own.message)) if own else ""
 
 
 def _is_moved(ask: PageRequest, name: str, version: str) -> bool:

@@ -74,7 +74,7 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
     pages = max(1, -(-len(chosen) // _ROWS))
     page = min(max(_read_number(ask, "page"), 1), pages)
     graded = sorted(t.grade.points for t in shown.teams.values() if t.grade.status == "graded")
-    titles = {asked.id: capital(asked.title or asked.id) for asked in shown.rubric.criteria}
+    titles = {id_: capital(title) for id_, title in shown.rubric.titles.items()}
     unseen = Filter(seen="no").chosen(shown)
     return ask.page(
         "grades",
@@ -120,7 +120,7 @@ def show_clean(ask: PageRequest) -> Response:
         title="Teams without a remark",
         teams=[one for one in Filter(seen="no").chosen(shown) if not one.grade.in_doubt],
         points=points_text,
-        titles={asked.id: capital(asked.title or asked.id) for asked in shown.rubric.criteria},
+        titles={id_: capital(title) for id_, title in shown.rubric.titles.items()},
         signature=ask.signature,
     )
 
@@ -164,12 +164,12 @@ def list_news(ask: PageRequest, shown: ClassView, *, since: int) -> dict[str, An
     about = ask.query("of")
     if latest != since:
         of_name = {team.submission: name for name, team in shown.teams.items()}
-        titles = {asked.id: asked.title for asked in shown.rubric.criteria}
+        titles = shown.rubric.titles
         for submission, override in ask.gradebook.changes_since(since):
             name = of_name.get(submission, STRANGER)
             points = "as graded" if override.points is None else points_text(override.points)
             points = "a comment" if override.what == "comment" else points
-            what = titles.get(override.criterion) or override.criterion
+            what = titles.get(override.criterion, override.criterion)
             if override.criterion == TOTAL:
                 what, points = "total", signed_points(override.points or 0.0)
             at = to_the_second(override.at)

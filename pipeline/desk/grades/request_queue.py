@@ -96,8 +96,7 @@ def _describe(
     wrong : why the answer was refused, or "".
     """
     rubric = shown.rubric
-    asked = next((c for c in rubric.criteria if c.id == request.criterion), None)
-    own = next((c for c in entry.grade.criteria if c.id == request.criterion), None)
+    asked, own = rubric.criterion(request.criterion), entry.grade.criterion(request.criterion)
     hidden = {} if shown.names is None else {"team": name, "submission": entry.submission}
     place = {"of": name, "criterion": request.criterion}
     failed = wrong and (ask.text("team"), ask.text("criterion")) == (name, request.criterion)
@@ -121,15 +120,14 @@ def _describe(
 
 def _find_title(rubric: Rubric, criterion: str) -> str:
     """Return the title of a criterion; its id if the rubric no longer has it."""
-    titles = {asked.id: asked.title for asked in rubric.criteria}
-    return capital(titles.get(criterion) or criterion)
+    return capital(rubric.titles.get(criterion, criterion))
 
 
 def _show_conflict(ask: PageRequest, shown: ClassView, conflict: Conflict) -> Response:
     """Show the typed answer next to the current state; nothing was changed."""
     name, criterion = ask.text("team"), ask.text("criterion")
-    entry = ask.gradebook.entry(shown.teams[name].submission)
-    own = next((c for c in entry.grade.criteria if c.id == criterion), None)
+    entry = ask.class_view.team(name)
+    own = entry.grade.criterion(criterion)
     points, request = points_text(own.points) if own else NOTHING, entry.requests.get(criterion)
     answered = request is not None and request.state == "answered"
     last = request.events[-1] if request and answered else conflict.now

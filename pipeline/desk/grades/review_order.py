@@ -117,7 +117,7 @@ class Filter:
         seen = sum(bool(team.reviewed_by) for team in teams)
         numbers = {"no": len(teams) - seen, "yes": seen}
         lost = {key: len(names) for key, names in shown.lost.items()}
-        titles = {c.id: c.title or c.id for c in shown.rubric.criteria}
+        titles = shown.rubric.titles
         by_state = {key: sum(map(test, teams)) for key, (_, test) in _STATES.items()}
         remarks = {c: f"{WORDS.text(f'title_{c}')} ({flags[c]})" for c in common}
         return [

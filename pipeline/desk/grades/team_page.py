@@ -110,7 +110,7 @@ def act(ask: PageRequest) -> Response:
         return ask.back(to, f"{team.grade.submission}: accepted.")
     criterion, seen = TOTAL if what == "adjust" else ask.text("criterion"), ask.text("seen")
     if what == "repair":
-        return _repair(ask, shown, team, by=by)
+        return _repair(ask, team, by=by)
     try:
         if what == "adjust":
             points = read_points(ask.text("points"))
@@ -143,10 +143,10 @@ def _find_next(shown: ClassView, wanted: Filter, team: Entry) -> str:
     return after or next((o.grade.submission for o in left.chosen(shown) if o != team), "")
 
 
-def _repair(ask: PageRequest, shown: ClassView, team: Entry, *, by: str) -> Response:
+def _repair(ask: PageRequest, team: Entry, *, by: str) -> Response:
     """Save a repaired `submission.toml` of a team if it is valid, and grade the class again."""
     place, text = ask.place_or_404(), ask.text("text").replace("\r\n", "\n")
-    if not isinstance(place, Path) or shown.names is not None:
+    if not isinstance(place, Path) or team.rubric.anonymous:
         raise HTTPException(404, "this file cannot be repaired here")
     repair = Repair(text=text, by=by, why=ask.text("why"))
     try:
@@ -163,12 +163,10 @@ def _repair(ask: PageRequest, shown: ClassView, team: Entry, *, by: str) -> Resp
     return ask.back(write_address(ask, team.grade.submission), message)
 
 
-def _show_repair(
-    ask: PageRequest, shown: ClassView, team: Entry, *, wrong: str
-) -> dict[str, str] | None:
+def _show_repair(ask: PageRequest, team: Entry, *, wrong: str) -> dict[str, str] | None:
     """Return what the form for the repair of `submission.toml` shows; None if it is not offered."""
     place = ask.place_or_404()
-    if not isinstance(place, Path) or shown.names is not None:
+    if not isinstance(place, Path) or team.rubric.anonymous:
         return None
     original = read_original(place, team.submission)
     if original is None:
@@ -188,9 +186,7 @@ def _show_repair(
 
 def show_figure(ask: PageRequest) -> Response:
     """Show one of a team's figures."""
-    team = ask.class_view.team(ask.query("of"))
-    book = ask.gradebook
-    drawn = dict(book.figures(book.entry(team.submission)))
+    drawn = dict(ask.gradebook.figures(ask.class_view.team(ask.query("of"))))
     name = ask.query("figure")
     if name not in drawn:
         raise HTTPException(404, "there is no such figure")
@@ -199,10 +195,7 @@ def show_figure(ask: PageRequest) -> Response:
 
 def send_paper(ask: PageRequest) -> Response:
     """Send a PDF that a team submitted."""
-    shown = ask.class_view
-    team = shown.team(ask.query("of"))
-    folder = _find_recordings(ask, shown, ask.gradebook.entry(team.submission))
-    name = ask.query("file")
+    folder, name = _find_recordings(ask, ask.class_view.team(ask.query("of"))), ask.query("file")
     if folder is None or name not in _list_papers(folder):
         raise HTTPException(404, "there is no such file")
     return served_files.send_paper(folder, name)
@@ -213,14 +206,14 @@ def _show_page(
 ) -> Response:
     shown = ask.class_view
     team = shown.team(ask.query("of"))
-    book, name = ask.gradebook, team.grade.submission
-    now, grade = team, team.grade
-    _, events = book.history(team.submission, shown_as=name if now.rubric.anonymous else "")
+    grade, name = team.grade, team.grade.submission
+    hidden = name if team.rubric.anonymous else ""
+    _, events = ask.gradebook.history(team.submission, shown_as=hidden)
     wanted = Filter.read(ask.request.query_params)
     before, after = wanted.beside(shown, name)
-    items = list_items(grade, now)
-    chosen = _find_chosen(ask, items, now.rubric)
-    folder = _find_recordings(ask, shown, now)
+    items = list_items(team)
+    chosen = _find_chosen(ask, items, team.rubric)
+    folder = _find_recordings(ask, team)
     return ask.page(
         "team",
         status=status,
@@ -233,16 +226,16 @@ def _show_page(
         grade=grade,
         points=points_text,
         person_lines=person_lines(grade),
-        total=_describe_total(ask, now, wrong=wrong),
-        seen=now.reviewed_by,
-        whole_version=now.whole_version,
+        total=_describe_total(ask, team, wrong=wrong),
+        seen=team.reviewed_by,
+        whole_version=team.whole_version,
         items=_link_items(ask, name, items, chosen),
         doubts=sum(item.doubt for item in items),
         events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
         news=list_news(ask, shown, since=shown.state[1]),
         signature=ask.signature,
-        repair=_show_repair(ask, shown, team, wrong=wrong_repair),
-        requests={criterion: request.state for criterion, request in now.requests.items()},
+        repair=_show_repair(ask, team, wrong=wrong_repair),
+        requests={criterion: request.state for criterion, request in team.requests.items()},
         recordings=folder,
         notes=_show_notes(ask, folder) if folder else "",
         papers=[
@@ -250,15 +243,15 @@ def _show_page(
             for paper in (_list_papers(folder) if folder else ())
         ],
         requests_at=f"{ask.here}requests?{urlencode({'of': name})}",
-        **_show_chosen(ask, shown, grade, now, chosen=chosen, wrong=wrong),
+        **_show_chosen(ask, shown, team, chosen=chosen, wrong=wrong),
     )
 
 
-def _describe_total(ask: PageRequest, now: Entry, *, wrong: str) -> dict[str, str]:
+def _describe_total(ask: PageRequest, team: Entry, *, wrong: str) -> dict[str, str]:
     """Return what the form for an adjustment shows; a refused one is shown as it was typed."""
     refused = bool(wrong) and ask.text("do") == "adjust"
     return {
-        "version": now.version(TOTAL),
+        "version": team.version(TOTAL),
         "points": ask.text("points") if refused else "",
         "why": ask.text("why") if refused else "",
         "wrong": wrong if refused else "",
@@ -294,19 +287,19 @@ def _link_items(
 
 
 def _show_chosen(
-    ask: PageRequest, shown: ClassView, grade: Grade, now: Entry, *, chosen: Item, wrong: str
+    ask: PageRequest, shown: ClassView, team: Entry, *, chosen: Item, wrong: str
 ) -> dict[str, Any]:
     """Return what is shown next to the list: the chosen criterion or flag, with its evidence."""
-    name, drawn = grade.submission, ask.gradebook.figures(now)
-    asked = next((c for c in now.rubric.criteria if c.id == chosen.id), None)
+    grade, drawn = team.grade, ask.gradebook.figures(team)
+    name, asked = grade.submission, team.rubric.criterion(chosen.id)
     if chosen.is_remark or asked is None:
         asked, one, flags = None, None, [flag for flag in grade.flags if flag.code == chosen.id]
     else:
         own = bool(wrong) and ask.text("do") != "adjust"
         typed = {key: ask.text(key) for key in ("points", "other", "why")} if own else {}
-        one = describe_criterion(asked, grade, now, typed=typed | ({"wrong": wrong} if own else {}))
-        flags = find_remarks(grade, asked, now.rubric)
-    own = next((c for c in grade.criteria if asked and c.id == asked.id), None)
+        one = describe_criterion(asked, team, typed=typed | ({"wrong": wrong} if own else {}))
+        flags = find_remarks(grade, asked, team.rubric)
+    own = grade.criterion(asked.id) if asked else None
     figures = show_figures(drawn, asked, own, first=ask.query("figure")) if asked else []
     reasons = ask.gradebook.reasons().get(asked.id, [])[:30] if asked else []
     return {
@@ -381,13 +374,12 @@ def _show_conflict(ask: PageRequest, name: str, conflict: Conflict) -> Response:
     """Show what a person typed next to the current state; nothing was changed."""
     now = ask.class_view.team(name)
     criterion = ask.text("criterion")
-    titles = {asked.id: asked.title for asked in now.rubric.criteria}
-    own = next((c for c in now.grade.criteria if c.id == criterion), None)
+    own = now.grade.criterion(criterion)
     undoing = ask.text("do") == "undo"
     return ask.page(
         "conflict",
         status=409,
-        title=f"{name}: {capital(titles.get(criterion) or criterion)}",
+        title=f"{name}: {capital(now.rubric.titles.get(criterion, criterion))}",
         typed={
             "points": "undo" if undoing else ask.text("other") or ask.text("points"),
             "why": ask.text("why"),
@@ -412,19 +404,19 @@ def write_address(ask: PageRequest, name: str, **more: str) -> str:
 # ------------------------------------------------------- criteria and flags
 
 
-def list_items(grade: Grade, now: Entry) -> list[Item]:
+def list_items(team: Entry) -> list[Item]:
     """Return the rows: those in doubt first, flags before criteria, then by points lost."""
-    judged = {criterion.id: criterion for criterion in grade.criteria}
+    grade, rubric = team.grade, team.rubric
     items = [
         Item(id=flag.code, is_remark=True, title=capital(WORDS.text(f"title_{flag.code}")))
         for flag in grade.flags
-        if not any(is_about(flag, asked, now.rubric) for asked in now.rubric.criteria)
+        if not any(is_about(flag, asked, rubric) for asked in rubric.criteria)
     ]
-    for asked in now.rubric.criteria:
-        own = judged.get(asked.id)
-        flagged = any(is_about(flag, asked, now.rubric) for flag in grade.flags)
+    for asked in rubric.criteria:
+        own = grade.criterion(asked.id)
+        flagged = any(is_about(flag, asked, rubric) for flag in grade.flags)
         earned = points_text(own.points) if own and own.id not in grade.open else NOTHING
-        by_hand = asked.id in now.overrides
+        by_hand = asked.id in team.overrides
         items.append(
             Item(
                 id=asked.id,
@@ -432,7 +424,7 @@ def list_items(grade: Grade, now: Entry) -> list[Item]:
                 points=f"{earned} / {points_text(asked.points)}",
                 outcome=WORDS.text(f"outcome_{own.outcome}") if own else "not judged",
                 tone=TONES[own.outcome] if own else "quiet",
-                lost=asked.points - now.automatic.get(asked.id, asked.points),
+                lost=asked.points - team.automatic.get(asked.id, asked.points),
                 doubt=own is None or own.outcome != "pass" or flagged or by_hand,
                 by_hand=by_hand,
             )
@@ -440,19 +432,17 @@ def list_items(grade: Grade, now: Entry) -> list[Item]:
     return sorted(items, key=lambda item: (not item.doubt, not item.is_remark, -item.lost))
 
 
-def describe_criterion(
-    asked: Asked, grade: Grade, now: Entry, *, typed: Mapping[str, str]
-) -> dict[str, Any]:
+def describe_criterion(asked: Asked, team: Entry, *, typed: Mapping[str, str]) -> dict[str, Any]:
     """Return what the page shows of a criterion, even if it was never judged.
 
     Parameters
     ----------
     typed : fields of a refused form (points, other, why), and why it was refused (wrong).
     """
-    own = next((c for c in grade.criteria if c.id == asked.id), None)
-    by_hand = now.overrides.get(asked.id) or now.comments.get(asked.id)
+    grade, own = team.grade, team.grade.criterion(asked.id)
+    by_hand = team.overrides.get(asked.id) or team.comments.get(asked.id)
     points = points_text(own.points) if own and own.id not in grade.open else ""
-    steps = list_steps(asked.points, now.rubric)
+    steps = list_steps(asked.points, team.rubric)
     chosen = typed.get("points") or points
     other = typed.get("other", "") or ("" if chosen in steps else chosen)
     return {
@@ -471,8 +461,8 @@ def describe_criterion(
         "other": other,
         "why": typed.get("why", ""),
         "wrong": typed.get("wrong", ""),
-        "version": now.version(asked.id),
-        "changed": asked.id in now.given,
+        "version": team.version(asked.id),
+        "changed": asked.id in team.given,
         "by_hand": _describe_by_hand(by_hand) if by_hand else "",
         "is_comment": by_hand is not None and by_hand.what == "comment",
         "own_reason": by_hand.text if by_hand else "",
@@ -569,20 +559,19 @@ def _list_papers(folder: Path) -> list[str]:
     return list(islice((n for n in names if file_problem(folder, n) is None), _MOST_PAPERS))
 
 
-def _find_recordings(ask: PageRequest, shown: ClassView, entry: Entry) -> Path | None:
+def _find_recordings(ask: PageRequest, team: Entry) -> Path | None:
     """Return the folder that was graded; None if it is not found or not allowed.
 
     A gradebook stores no folder, so the folder is looked for on this computer. Its
     files must be those that were graded, because a later version would show other
     recordings. Plots that were added since do not matter.
     """
-    if not ask.user.owns or shown.names is not None:
+    if not ask.user.owns or team.rubric.anonymous:
         return None
-    graded = entry.key.rpartition("-")[2]
-    for folder in dict.fromkeys(_list_candidates(ask, entry.submission)):
+    graded = team.key.rpartition("-")[2]
+    for folder in dict.fromkeys(_list_candidates(ask, team.submission)):
         if (folder / NAME).is_file():
-            now = (digest([folder], without=added) for added in ((), _ADDED))
-            if graded in now:
+            if graded in (digest([folder], without=added) for added in ((), _ADDED)):
                 return folder
     return None
 

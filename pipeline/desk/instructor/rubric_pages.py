@@ -292,7 +292,7 @@ def preview(ask: PageRequest) -> Response:
         found=found,
         teams=_name_teams(ask, place, found["teams"]),
         is_of=found["assignment"] == path.stem,
-        titles={c.id: c.title or c.id for c in typed.rubric.criteria},
+        titles=typed.rubric.titles,
     )
     return ask.page("rubric_preview", title=f"{path.name}: preview", page=page)
 

@@ -197,7 +197,7 @@ def _describe_judged(own: Criterion | None) -> dict[str, Any]:
 
 def _show_why(asked: Asked, seen: GradeView) -> str:
     """Return the evidence for a criterion as HTML."""
-    own = next((c for c in seen.grade.criteria if c.id == asked.id), None)
+    own = seen.grade.criterion(asked.id)
     if own is None:
         return ""
     if not seen.hides_numbers:

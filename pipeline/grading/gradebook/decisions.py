@@ -234,13 +234,8 @@ def is_unchanged(points: float | None, grade: Grade, criterion: str) -> bool:
 
     A page shows at most two decimals, so 1.33 leaves points of 4/3 as they are.
     """
-    now = None if criterion in grade.open else points_of(grade, criterion)
-    return now is not None and points in (now, float(points_text(now)))
-
-
-def points_of(grade: Grade, criterion: str) -> float | None:
-    """Return the points of a criterion; None if it was never judged."""
-    return next((own.points for own in grade.criteria if own.id == criterion), None)
+    own = grade.judged.get(criterion)
+    return own is not None and points in (own.points, float(points_text(own.points)))
 
 
 # ---------------------------------------------------------------------------- requests
