@@ -25,6 +25,7 @@ from pipeline.desk.navigation import list_links
 from pipeline.desk.parts import leave_out_parts
 from pipeline.desk.users import Place, User, Visibility, name_place
 from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.events import Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.words import points_text
 from pipeline.processes import Failed
@@ -189,6 +190,11 @@ class PageRequest:
     def class_view(self) -> ClassView:
         """The class that the URL names, in its current state."""
         return self.desk.gradebooks.of(self.place_or_404())
+
+    @property
+    def team(self) -> Entry:
+        """The team that the URL names."""
+        return self.class_view.team(self.query("of"))
 
     @property
     def signature(self) -> str:

@@ -91,8 +91,7 @@ def show(ask: PageRequest) -> Response:
 
 def act(ask: PageRequest) -> Response:
     """Do what the pressed button says: sign, accept, unmark, change points, or undo."""
-    shown = ask.class_view
-    team = shown.team(ask.query("of"))
+    shown, team = ask.class_view, ask.team
     book, name, what = ask.gradebook, team.submission, ask.text("do")
     by = ask.sign()
     if what == "unsee":
@@ -186,7 +185,7 @@ def _show_repair(ask: PageRequest, team: Entry, *, wrong: str) -> dict[str, str]
 
 def show_figure(ask: PageRequest) -> Response:
     """Show one of a team's figures."""
-    drawn = dict(ask.gradebook.figures(ask.class_view.team(ask.query("of"))))
+    drawn = dict(ask.gradebook.figures(ask.team))
     name = ask.query("figure")
     if name not in drawn:
         raise HTTPException(404, "there is no such figure")
@@ -195,7 +194,7 @@ def show_figure(ask: PageRequest) -> Response:
 
 def send_paper(ask: PageRequest) -> Response:
     """Send a PDF that a team submitted."""
-    folder, name = _find_recordings(ask, ask.class_view.team(ask.query("of"))), ask.query("file")
+    folder, name = _find_recordings(ask, ask.team), ask.query("file")
     if folder is None or name not in _list_papers(folder):
         raise HTTPException(404, "there is no such file")
     return served_files.send_paper(folder, name)
@@ -204,8 +203,7 @@ def send_paper(ask: PageRequest) -> Response:
 def _show_page(
     ask: PageRequest, *, wrong: str = "", wrong_repair: str = "", status: int = 200
 ) -> Response:
-    shown = ask.class_view
-    team = shown.team(ask.query("of"))
+    shown, team = ask.class_view, ask.team
     grade, name = team.grade, team.grade.submission
     hidden = name if team.rubric.anonymous else ""
     _, events = ask.gradebook.history(team.submission, shown_as=hidden)
@@ -213,7 +211,7 @@ def _show_page(
     before, after = wanted.beside(shown, name)
     items = list_items(team)
     chosen = _find_chosen(ask, items, team.rubric)
-    folder = _find_recordings(ask, team)
+    folder, repair = _find_recordings(ask, team), _show_repair(ask, team, wrong=wrong_repair)
     return ask.page(
         "team",
         status=status,
@@ -234,7 +232,7 @@ def _show_page(
         events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
         news=list_news(ask, shown, since=shown.state[1]),
         signature=ask.signature,
-        repair=_show_repair(ask, team, wrong=wrong_repair),
+        repair=repair,
         requests={criterion: request.state for criterion, request in team.requests.items()},
         recordings=folder,
         notes=_show_notes(ask, folder) if folder else "",
@@ -397,8 +395,10 @@ def _show_conflict(ask: PageRequest, name: str, conflict: Conflict) -> Response:
 
 def write_address(ask: PageRequest, name: str, **more: str) -> str:
     """Return the URL of a team's page; it keeps the filter, so that next and previous work."""
-    wanted = Filter.read(ask.request.query_params).query
-    return f"{ask.here}team?{urlencode({'of': name, **more})}" + (f"&{wanted}" if wanted else "")
+    asked = ask.request.query_params
+    kept = {key: asked[key].strip() for key in Filter.__dataclass_fields__ if key in asked}
+    wanted = {key: value for key, value in kept.items() if value}
+    return f"{ask.here}team?{urlencode({'of': name, **more, **wanted})}"
 
 
 # ------------------------------------------------------- criteria and flags
