@@ -13,7 +13,8 @@ from starlette.exceptions import HTTPException
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.decisions import points_lost
 from pipeline.grading.gradebook.events import Entry
-from pipeline.grading.gradebook.gradebook import ClassNow, Gradebook, State
+from pipeline.grading.gradebook.gradebook import Gradebook, State
+from pipeline.grading.gradebook.rows import ClassNow
 from pipeline.grading.publish.pseudonyms import anonymise, pseudonyms
 from pipeline.grading.rubric import Rubric
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from sqlalchemy import Connection, Row, func, select
 
@@ -29,6 +29,7 @@ from pipeline.grading.gradebook.events import (
 from pipeline.grading.gradebook.history import points_changes, read_history, rubric_changes
 from pipeline.grading.gradebook.rows import (
     GRADING,
+    ClassNow,
     add_event,
     add_list,
     add_row,
@@ -37,7 +38,6 @@ from pipeline.grading.gradebook.rows import (
     class_list,
     erase_rows,
     find_requests,
-    first_keys,
     in_class,
     is_released,
     known_grading,
@@ -46,8 +46,8 @@ from pipeline.grading.gradebook.rows import (
     newest_of,
     pages,
     points_of,
+    read_class,
     read_entries,
-    read_entry,
     read_events,
     read_figures,
     read_flag,
@@ -111,25 +111,6 @@ class Queue:
     settled: Sequence[tuple[Entry, Request]]
     n_waiting: int
     n_settled: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClassNow:
-    """The class list with current grades.
-
-    Attributes
-    ----------
-    made_of : the entries in order, by the data that each was made from; an entry is valid until
-        they change.
-    """
-
-    rubric: Rubric
-    made_of: Mapping[tuple[Any, ...], Entry]
-
-    @property
-    def entries(self) -> list[Entry]:
-        """The entries in the order of the class list."""
-        return list(self.made_of.values())
 
 
 class Gradebook:
@@ -455,34 +436,7 @@ class Gradebook:
         before : an earlier result, whose unchanged entries are reused.
         """
         with self._database.reading() as connection:
-            last = self._last(connection)
-            rubric, members = read_rubric(last), in_class(last)
-            done = read_events(connection, events.c.submission_id.in_(members))
-            keys = first_keys(connection, members)
-            known = before.made_of if before and before.rubric == rubric else {}
-            columns = gradings.c.id, gradings.c.at, gradings.c.submission_id
-            made_of = {
-                row.position: (
-                    (row.id, row.at), row.shared, *(e.id for e in done.get(row.submission_id, ()))
-                )
-                for row in connection.execute(class_list(last, *columns))
-            }  # fmt: skip
-            listed = {at: known[of] for at, of in made_of.items() if of in known}
-            rows = class_list(last)
-            if listed:
-                rows = rows.where(
-                    entries.c.position.in_([at for at in made_of if at not in listed])
-                )
-            for row in connection.execute(rows):
-                number = row.submission_id
-                listed[row.position] = read_entry(
-                    row,
-                    done.get(number, ()),
-                    shared=read_flag(row.shared),
-                    rubric=rubric,
-                    first_key=keys[number],
-                )
-            return ClassNow(rubric=rubric, made_of={of: listed[at] for at, of in made_of.items()})
+            return read_class(connection, self._last(connection), before)
 
     # ------------------------------------------------------------------ what people do
 

@@ -5,7 +5,8 @@ import json
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
 from pydantic import ValidationError
 from sqlalchemy import (
@@ -203,6 +204,54 @@ def read_entries(
         )
         for row, shared in lines
     ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassNow:
+    """The class list with current grades.
+
+    Attributes
+    ----------
+    made_of : the entries in order, by the data that each was made from; an entry is valid until
+        they change.
+    """
+
+    rubric: Rubric
+    made_of: Mapping[tuple[Any, ...], Entry]
+
+    @property
+    def entries(self) -> list[Entry]:
+        """The entries in the order of the class list."""
+        return list(self.made_of.values())
+
+
+def read_class(connection: Connection, batch: Row, before: ClassNow | None) -> ClassNow:
+    """Return a class list with current grades, with the unchanged entries of an earlier result."""
+    rubric, members = read_rubric(batch), in_class(batch)
+    done = read_events(connection, events.c.submission_id.in_(members))
+    keys = first_keys(connection, members)
+    known = before.made_of if before and before.rubric == rubric else {}
+    columns = gradings.c.id, gradings.c.at, gradings.c.submission_id
+    made_of = {
+        row.position: (
+            (row.id, row.at), row.shared, *(e.id for e in done.get(row.submission_id, ()))
+        )
+        for row in connection.execute(class_list(batch, *columns))
+    }  # fmt: skip
+    listed = {at: known[of] for at, of in made_of.items() if of in known}
+    rows = class_list(batch)
+    if listed:
+        rows = rows.where(entries.c.position.in_([at for at in made_of if at not in listed]))
+    for row in connection.execute(rows):
+        number = row.submission_id
+        listed[row.position] = read_entry(
+            row,
+            done.get(number, ()),
+            shared=read_flag(row.shared),
+            rubric=rubric,
+            first_key=keys[number],
+        )
+    return ClassNow(rubric=rubric, made_of={of: listed[at] for at, of in made_of.items()})
 
 
 def read_entry(
