@@ -335,11 +335,11 @@ class Rubric(TomlTable):
 
     @property
     def titles(self) -> dict[str, str]:
-        """The titles of the criteria, by id; the id if a criterion has none."""
+        """The titles of the criteria, by id; a criterion without a title is called by its id."""
         return {asked.id: asked.title or asked.id for asked in self.criteria}
 
     def criterion(self, id_: str) -> Criterion | None:
-        """Return a criterion; None if the rubric has none of this id."""
+        """Return the criterion with this id, or None."""
         return next((asked for asked in self.criteria if asked.id == id_), None)
 
     @property
