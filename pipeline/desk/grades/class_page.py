@@ -239,13 +239,9 @@ def show_class_page(ask: PageRequest) -> Response:
 
 def show_feedback(ask: PageRequest) -> Response:
     """Show the feedback that a team reads, in its current state."""
-    shown = ask.class_view
-    team = shown.team(ask.request.path_params["name"])
-    book = ask.gradebook
-    entry = book.entry(team.submission)
-    seen = view(entry, "staff", names=shown.names)
-    page = feedback_page(seen, figures=book.figures(entry), name=seen.grade.submission)
-    return show_own_page(page)
+    team = ask.class_view.team(ask.request.path_params["name"])
+    figures, name = ask.gradebook.figures(team), team.grade.submission
+    return show_own_page(feedback_page(view(team, "staff"), figures=figures, name=name))
 
 
 # --------------------------------------------------------------------- actions
