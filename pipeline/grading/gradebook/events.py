@@ -167,13 +167,13 @@ def _by_hand(criterion: Criterion, points: float, *, why: str, manual: bool) -> 
     points = min(points, criterion.out_of)  # an earlier rubric may have given more points
     if points == criterion.points and not manual:
         return _with_comment(criterion, why)
+    by_hand = f"Set by hand from {criterion.points:g} to {points:g} of {criterion.out_of:g}: {why}"
+    # Of a criterion that passed, the grader says that all is right. The person disagrees.
+    message = by_hand if criterion.outcome == "pass" else f"{criterion.message} {by_hand}"
     changed = {
         "points": points,
         "outcome": "pass" if points >= criterion.out_of else "partial" if points > 0 else "fail",
-        "message": why
-        if manual
-        else f"{criterion.message} Set by hand from {criterion.points:g} to {points:g} "
-        f"of {criterion.out_of:g}: {why}",
+        "message": why if manual else message,
     }
     return criterion.model_copy(update=changed)
 

@@ -229,6 +229,17 @@ def test_an_override_never_exceeds_the_points_of_the_rubric(open_book):
     assert (line.points, line.outcome) == (1.0, "pass")
 
 
+def test_fewer_points_by_hand_leave_out_that_all_is_right(open_book):
+    """Of a criterion that passed, the message of the grader goes; that of another one stays."""
+    book = open_book()
+    for team, share in (("team-1", 1.0), ("team-2", 0.5)):
+        finish(book, make_grade(team, share=share))
+        said = criterion(book.entry(team).grade, "state-model").message
+        book.override(team, "state-model", 0.25, why="copied", by="Ada")
+        model = criterion(book.entry(team).grade, "state-model")
+        assert (said in model.message, "copied" in model.message) == (share < 1, True)
+
+
 @pytest.mark.parametrize(
     ("arguments", "why", "named"),
     [
