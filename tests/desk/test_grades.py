@@ -503,6 +503,19 @@ def test_only_one_of_two_simultaneous_changes_counts(two_desks, database):
         assert len([o for _, o in book.changes_since(0) if o.criterion == "pieces"]) == 20
 
 
+def test_a_submission_without_a_grade_can_be_taken_off_the_list(ta, grades):
+    """A submission that could not be graded can leave the class list; one with a grade cannot."""
+    assert 'value="remove"' in ta.get(at("broken")).text
+    assert 'value="remove"' not in ta.get(at("team-01")).text
+    assert ta.post(at("team-01"), do="remove").status == 400
+    assert ta.post(at("broken"), do="remove").status == 303
+    with Gradebook(grades) as book:
+        left = {entry.submission for entry in book.entries()}
+        assert [event.what for event in book.history("broken")[1]][-1] == "removed"
+    assert ("team-01" in left, "broken" in left) == (True, False)
+    assert ta.get(at("broken")).status == 404
+
+
 # ------------------------------------------------------------------------------ in and out
 
 

@@ -14,7 +14,7 @@ from starlette.responses import Response
 
 from pipeline.desk import served_files
 from pipeline.desk.gradebooks import ClassView
-from pipeline.desk.grades.class_page import list_news
+from pipeline.desk.grades.class_page import list_news, may_release
 from pipeline.desk.grades.grading_form import start_grading
 from pipeline.desk.grades.review_order import Filter
 from pipeline.desk.jobs import Busy
@@ -84,6 +84,11 @@ class Item:
     by_hand: bool = False
 
 
+def may_remove(ask: PageRequest, team: Entry) -> bool:
+    """Return whether the person may take a submission off the class list: one without a grade."""
+    return team.grade.status == "failed" and may_release(ask)
+
+
 def show(ask: PageRequest) -> Response:
     """Show a team."""
     return _show_page(ask)
@@ -96,6 +101,10 @@ def act(ask: PageRequest) -> Response:
     by = ask.sign()
     if what == "unsee":
         book.set_reviewed(name, by=by, reviewed=False)
+    if what == "remove" and may_remove(ask, team):
+        book.remove([name])
+        text = f"{team.grade.submission}: no longer in the class. Its history stays."
+        return ask.back(ask.here, text)
     if what in ("sign", "unsee"):
         return ask.back(write_address(ask, team.grade.submission))
     if what == "accept":
@@ -227,6 +236,7 @@ def _show_page(
         total=_describe_total(ask, team, wrong=wrong),
         seen=team.reviewed_by,
         whole_version=team.whole_version,
+        may_remove=may_remove(ask, team),
         items=_link_items(ask, name, items, chosen),
         doubts=sum(item.doubt for item in items),
         events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
