@@ -199,7 +199,7 @@ def _describe_submission(ask: PageRequest, n: int, folder: Path) -> OpenSubmissi
 def _describe_class(ask: PageRequest, n: int, place: Place) -> OpenClass:
     """Return the state of a class: whether work is running there, and how many were reviewed."""
     try:
-        teams = ask.desk.gradebooks.of(place).now.rows
+        teams = ask.desk.gradebooks.of(place).now.entries
     except (PipelineError, OSError):
         teams = ()
     job = ask.desk.jobs.of(place) if isinstance(place, Path) else None
