@@ -38,7 +38,7 @@ def check_book(place: str, journal: Journal, *, teams: Sequence[str], found: Fou
         given: dict[tuple[str, str, str], list[Any]] = defaultdict(list)
         for team, one in book.changes_since(0):
             given[team, one.criterion, one.text].append(one)
-        listed = [one.submission for one in book.class_now().rows]
+        listed = [one.submission for one in book.class_now().entries]
         if sorted(listed) != sorted(teams):
             found.lost.append(f"the class list has {len(listed)} of {len(teams)} teams")
         asked = {one.where[0] for one in journal.sent if one.kind in ("request", "answer")}
