@@ -286,7 +286,7 @@ def _describe(search: Search, bench: Setup) -> Gap:
     """Return the result of a search as a `Gap`."""
     study, path, chosen, final = search.study, search.path, search.chosen, search.final
     verdict, found, close = search.verdict, search.found, search.close
-    driven = any(np.any(run.command) for run in study.training)
+    driven = any(run.driven for run in study.training)
     # Without an input, the first mass is set to 1, so this is the unit of forces.
     units = bench.units if driven else replace(bench.units, input=f"{bench.units.position}/s^2")
     effects = list_effects(path, final, found, units)

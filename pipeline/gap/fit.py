@@ -309,7 +309,7 @@ def _follow(
 
 def anchor(runs: Sequence[GapRun], size: int) -> Array:
     """Return an equation that fixes the first free mass if no input sets the scale of forces."""
-    if any(np.any(run.command) for run in runs):
+    if any(run.driven for run in runs):
         return np.zeros((0, size + 1))
     if not size:
         return np.zeros((0, 1))

@@ -26,6 +26,7 @@ _SMOOTHING = 0.03  # s, half width of a local cubic for a bench of carts
 # `_HELD_TIME` times as long as in free motion.
 _HELD_SAMPLES = 4
 _HELD_TIME = 2.0
+_HELD_STILL = 0.1  # s; carts that an input moves at once do not rest this long
 _RESTING = 1.5  # encoder steps; largest range of readings of a cart at rest
 _ONE_READING = 0.07  # s; at rest, this time counts as one independent reading
 
@@ -41,7 +42,8 @@ class GapRun:
     rows : cart index (from 0) of each row. Held carts have no row.
     free : whether each cart moves (n,).
     guided : motion (n, samples) of held carts that still move; zero for all other carts.
-    knots, command : times and values of the input, held from knot to knot.
+    knots, command : times and values of the input, held from knot to knot. They begin before the
+        first sample, because a delay or a lag remembers the earlier input.
     at_rest : whether the carts are at rest at the first sample.
     start_known : whether the start is taken from the first readings, as on a bench without springs.
         Otherwise it is fitted.
@@ -100,9 +102,12 @@ class GapRun:
     @property
     def input(self) -> Array:
         """The input (samples,) at each sample."""
-        if self.knots.size == self.t.size:
-            return self.command
         return np.interp(self.t, self.knots, self.command)
+
+    @cached_property
+    def driven(self) -> bool:
+        """Whether the input acts during the run."""
+        return bool(np.any(self.input))
 
     def by_cart(self, rows: Array, zero: Array) -> Array:
         """Return the positions (n, samples) for readings (rows, samples) and encoder zeros (n,).
@@ -168,13 +173,14 @@ class GapRun:
         )
 
 
-def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
+def make_run(record: Record, *, n: int, part_of: Record | None = None) -> GapRun:
     """Prepare one record of a bench with n carts.
 
-    `in_motion` is true for a part of a longer record, which may begin in motion. Such a part starts
-    at its first turning point, where no hand can still act. A decay starts after the hand has let
-    go; earlier samples are cut.
+    `part_of` is the whole record, if this one is a later part of it and so may begin in motion.
+    Such a part starts at its first turning point, where no hand can still act. A decay starts after
+    the hand has let go; earlier samples are cut.
     """
+    in_motion = part_of is not None
     rows = tuple(cart - 1 for cart in record.carts if cart in record.free)
     y = np.array([record.position(row + 1) for row in rows])
     resolution = np.array([record.encoder_step(row + 1) for row in rows])
@@ -205,7 +211,7 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
     else:
         moving = _smooth_states(t, y, np.zeros(1, dtype=np.int64), window=_SMOOTHING * pace)
         start[own], slope[own] = moving[0][:, 0], moving[1][:, 0]
-    knots, command = _held_input(t, u) if record.hold == "band_limited" else (t, u)
+    knots, command = _input_of(part_of or record, before=0.0 if balanced else None)
     rate = 1.0 / float(np.median(np.diff(t)))
     length = max(2, round(_ONE_READING * pace * rate))
     return GapRun(
@@ -216,8 +222,8 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
         rows=rows,
         free=tuple(i + 1 in record.free for i in range(n)),
         guided=guided - np.median(guided, axis=1, keepdims=True),
-        knots=np.ascontiguousarray(knots),
-        command=np.ascontiguousarray(command),
+        knots=knots,
+        command=command,
         at_rest=at_rest,
         start=start,
         slope=slope,
@@ -239,18 +245,32 @@ def _begins_at_rest(y: Array, u: Array, still: Array, sample_time: float) -> tup
     # Samples before the input changes. The first two always count, because the input has no effect
     # yet.
     quiet = max(2, int(np.argmax(u != u[0])) + 1)
-    # A run without motion in its first 20 ms starts at rest.
-    look = max(2, min(quiet, round(0.02 / sample_time)))
+    # A run without motion in its first 20 ms starts at rest. An input that acts from the first
+    # sample moves the carts sooner.
+    look = 2 if u[0] != 0.0 else max(2, min(quiet, round(0.02 / sample_time)))
     at_rest = bool(np.all(np.ptp(y[:, :look], axis=1) <= still))
     # A cart that moves before the input changes was held, so it was not in equilibrium.
     in_place = bool(np.all(np.ptp(y[:, :quiet], axis=1) <= still))
-    return at_rest, at_rest and in_place and bool(u[0] == 0.0)
+    if u[0] == 0.0:
+        return at_rest, at_rest and in_place
+    # An input that moves the carts at once was switched on with the first sample. If the input
+    # changes too soon to tell, carts that rest at zero were not pushed before.
+    pushed = in_place and (quiet * sample_time > _HELD_STILL or bool(np.any(np.abs(y[:, 0]) > still)))
+    return at_rest, at_rest and not pushed
 
 
-def _held_input(t: Array, u: Array) -> tuple[Array, Array]:
-    """Return knots, and a held input that keeps the band-limited input's mean between knots."""
-    knots, smooth = interpolate_band_limited(t, u)
-    return knots, np.append(0.5 * (smooth[1:] + smooth[:-1]), smooth[-1])
+def _input_of(record: Record, *, before: float | None) -> tuple[Array, Array]:
+    """Return knots and the held input of a record, with the input before its first sample.
+
+    By default this is the first input. A band-limited input keeps its mean between knots.
+    """
+    u = np.zeros(record.t.size) if record.u is None else record.u
+    first = float(u[0]) if before is None else before
+    knots, command = record.t, u
+    if record.hold == "band_limited":
+        knots, smooth = interpolate_band_limited(record.t, u)
+        command = np.append(0.5 * (smooth[1:] + smooth[:-1]), smooth[-1])
+    return np.append(knots[0] - record.sample_time, knots), np.append(first, command)
 
 
 def _guided(record: Record, *, n: int) -> Array:
@@ -451,7 +471,7 @@ def prepare(
     runs = [run for record in usable for run in _free_runs(record, interventions, n=n)]
     if not runs:
         raise DataError("gap: no record shows half a second of motion without a hand in it")
-    if not any(np.any(run.command) for run in runs):
+    if not any(run.driven for run in runs):
         notes.append(words.text("note_no_input"))
     kept = without_twins(runs)
     if len(kept) < len(runs):
@@ -471,7 +491,7 @@ def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int)
             if later:
                 let_go = piece.u is None or not np.any(piece.u)
                 piece = replace(piece, kind="decay" if let_go else "sweep")
-            run = make_run(piece, n=n, in_motion=later)
+            run = make_run(piece, n=n, part_of=record if later else None)
             # A cart that rests until a hand moves it shows nothing.
             if piece.kind != "decay" or _last_away(run):
                 runs.append(run)
@@ -541,11 +561,13 @@ def split_holdout(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun]
             reference=None,
         )
         starts = piece.start == 0 and run.record.kind != "decay"
-        part = make_run(record, n=run.zero.size, in_motion=not starts)
+        part = make_run(record, n=run.zero.size, part_of=None if starts else run.record)
         pieces.append(
             replace(
                 part,
                 guided=run.guided[:, piece],
+                knots=run.knots,
+                command=run.command,
                 zero=run.zero,
                 zero_std=run.zero_std,
                 rest=run.rest,
@@ -626,8 +648,8 @@ def _size(run: GapRun) -> float:
     """
     if run.record.reference is not None and np.ptp(run.record.reference) > 0.0:
         return float(np.ptp(run.record.reference))
-    if np.any(run.command):
-        return float(run.command[np.argmax(np.abs(run.command))])
+    if run.driven:
+        return float(run.input[np.argmax(np.abs(run.input))])
     offset = run.start - run.zero
     return float(offset[np.argmax(np.abs(offset))])
 

@@ -98,7 +98,7 @@ def find_windows(fit: GapFit, runs: Sequence[GapRun]) -> tuple[GapWindow, ...]:
 def _what(run: GapRun, x: Array, energy: Array) -> str:
     """Return in words what the cart does where the misfit is larger than chance allows."""
     v = np.gradient(x, run.t)
-    u = np.interp(run.t, run.knots, run.command)
+    u = run.input
     edges = np.flatnonzero(np.abs(np.diff(u)) > 0.2 * max(1e-12, float(np.ptp(u))))
     since = np.full(run.t.size, np.inf)
     for edge in edges:
@@ -354,7 +354,7 @@ def repeatability(runs: Sequence[GapRun]) -> float | None:
     squares, sizes = 0.0, 0.0
     for i, a in enumerate(runs):
         for b in runs[:i]:
-            if a.id == b.id or a.free != b.free or a.rows != b.rows or not np.any(a.command):
+            if a.id == b.id or a.free != b.free or a.rows != b.rows or not a.driven:
                 continue
             t = a.t - _edge(a) + _edge(b)
             inside = (t >= b.t[0]) & (t <= b.t[-1])

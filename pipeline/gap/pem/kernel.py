@@ -312,7 +312,7 @@ def predict_run(laws, run, state, work, E, J):
     derive = lanes > 0
     drive, L = 3 * n + 1, kinds.size
     delay, lag = p[drive + 2], max(p[drive + 3], 1e-7)
-    lagged = held[0, 0, 0]
+    lagged = held[0, 0, 0]  # the drive at rest, before the first knot
     position = 0
     on = 0
     # The motor is a separate body while it crosses the backlash. In contact it is one body with
@@ -375,14 +375,24 @@ def predict_run(laws, run, state, work, E, J):
             end = now + h - delay
             if sample == 0 and sub == 0:
                 begin = now - delay
-                while position < knots.size - 1 and knots[position + 1] <= begin:
+                while knots[position] < begin:
+                    u, u_w, u_l = held[0, 0, position], held[1, 0, position], held[2, 0, position]
+                    last = position == knots.size - 1 or knots[position + 1] > begin
+                    since = (begin if last else knots[position + 1]) - knots[position]
+                    decay = exp(-since / lag)
+                    dlag[0] = u_w + (dlag[0] - u_w) * decay
+                    dlag[1] = u_l + (dlag[1] - u_l) * decay
+                    dlag[3] = dlag[3] * decay + (lagged - u) * decay * since / (lag * lag)
+                    lagged = u + (lagged - u) * decay
+                    dlag[2] = (lagged - u) / lag
+                    if last:
+                        break
                     position += 1
                 since = begin - knots[position]
                 past = held[0, 1, position] + held[0, 0, position] * since
                 past_w = held[1, 1, position] + held[1, 0, position] * since
                 past_l = held[2, 1, position] + held[2, 0, position] * since
                 u_past = held[0, 0, position]
-                lagged = u_past
             while position < knots.size - 1 and knots[position + 1] <= end:
                 position += 1
             since = end - knots[position]

@@ -385,7 +385,8 @@ class Excitation(NamedTuple):
     Attributes
     ----------
     t : times (samples,).
-    knots, command : times and values (k,) of the input, held from knot to knot.
+    knots, command : times and values (k,) of the input, held from knot to knot. The knots may begin
+        before the first sample; the drive is at rest before them.
     held : work array (3, k) for the input after the drive's laws, and its two integrals.
     free : whether each cart moves (n,).
     guided : prescribed motion (n, samples) of the other carts; zero by default.
@@ -524,6 +525,18 @@ def _integral(run, time, at):
 
 
 @jit
+def _lag_before(run, time, tau):
+    """Return the lagged input at `time`, if the drive was at rest before the first knot."""
+    knots, held = run.knots, run.held
+    lagged, at = held[0, 0], 0
+    while at < knots.size and knots[at] < time:
+        span = (min(knots[at + 1], time) if at < knots.size - 1 else time) - knots[at]
+        lagged = held[0, at] + (lagged - held[0, at]) * exp(-span / tau)
+        at += 1
+    return lagged
+
+
+@jit
 def _edge(run, delay, now, end, at):
     """Return when the delayed input first jumps after `now`, at the latest `end`."""
     knots, held = run.knots, run.held
@@ -632,7 +645,7 @@ def _simulate(tables, bodies, run, start, lanes, y, dy):
             span = knots[i] - knots[i - 1]
             held[1, i] = held[1, i - 1] + held[0, i - 1] * span
             held[2, i] = held[2, i - 1] + 0.5 * (held[1, i - 1] + held[1, i]) * span
-    lagged = held[0, 0]
+    lagged = _lag_before(run, t[0] - delay, tau) if tau > 0.0 else 0.0
     driven = bodies.driven
     at = knots.size - 1
     powered = 0
