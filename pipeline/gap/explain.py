@@ -14,13 +14,15 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pipeline.errors import DataError
 from pipeline.estimation.force_balance import find_interventions
-from pipeline.gap.fit import Fitting, GapFit, Mapper, fit_baseline
+from pipeline.gap.fit import Fitting, GapFit, Mapper, first_chain, fit_baseline
 from pipeline.gap.judge import Study
+from pipeline.gap.pem.fit import start_all
 from pipeline.gap.pem.model import compile_predictor
 from pipeline.gap.residual import map_residual, windowed_residual_forces
-from pipeline.gap.runs import drop_left_out, prepare, split_holdout
-from pipeline.gap.search import Deadline, Search
+from pipeline.gap.runs import notes_left_out, prepare, split_holdout
+from pipeline.gap.search import Deadline, Search, are_followed, follow
 from pipeline.gap.summary import (
     chain_covariance,
     chain_std,
@@ -40,7 +42,7 @@ from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import Effect, EffectTerm
 from pipeline.plant.simulator.compiler import is_compiled, kept_in
-from pipeline.results import Analysis, Record
+from pipeline.results import Analysis, Intervention, Record
 from pipeline.setup import Setup
 from pipeline.startup import with_one_thread
 from pipeline.words.phrases import phrases
@@ -188,7 +190,8 @@ def predictor_compiled() -> Iterator[None]:
 def investigate(analysis: Analysis, *, progress: Progress, budget: float | None = None) -> Gap:
     """Explain the gap of a submission's time records, starting from the identified chain.
 
-    Recordings that the identification left out are not used here either. `budget` is a time limit
+    Recordings that the identification left out are not used here either, unless they only differ
+    from a linear chain and the laws of the catalogue follow them. `budget` is a time limit
     in s, not counting compilation; if it is reached, the result is the best answer so far.
 
     Without a spring that the recordings show, no effect is searched for, because every effect would
@@ -198,27 +201,34 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
     ------
     DataError : no record can be used.
     """
-    records, notes = drop_left_out(analysis.records, left_out=analysis.left_out)
     start = analysis.fit and analysis.fit.chain  # even a failed fit is near enough to start from
     progress("preparing the simulator")
     with predictor_compiled():
         compile_simulator()
     compile_predictor()
+    out = {one.experiment for one in analysis.left_out}
+    odd = {one.experiment for one in analysis.left_out if one.excludes == "odd"}
+    records = [record for record in analysis.records if record.id not in out]
+    if analysis.records and not records:
+        reasons = "; ".join(notes_left_out(analysis.left_out))
+        raise DataError(f"gap: every recording is left out; {reasons}")
+    doubtful = [record for record in analysis.records if record.id in odd]
     explain = partial(explain_gap, records, analysis.bench, chain=start, progress=progress)
     if analysis.lacks_springs:
         gap = explain(catalogue=(), budget=budget)
         gap = replace(gap, residual=(), contenders=(), next_experiment="")
     else:
-        gap = explain(budget=budget)
+        gap = explain(doubtful=doubtful, budget=budget)
     used = {*gap.training, *gap.held_out}
+    left_out = tuple(one for one in analysis.left_out if one.experiment not in used)
     return replace(
         gap,
         title=analysis.title,
         provenance=analysis.provenance,
-        left_out=analysis.left_out,
+        left_out=left_out,
         groups=analysis.groups,
         causes=tuple(c for c in analysis.causes if not c.run or c.run in used),
-        notes=(*notes, *gap.notes),
+        notes=(*notes_left_out(left_out), *gap.notes),
     )
 
 
@@ -227,6 +237,7 @@ def explain_gap(
     bench: Setup,
     *,
     chain: Chain | None = None,
+    doubtful: Sequence[Record] = (),
     catalogue: Sequence[Effect] = CATALOGUE,
     budget: float | None = None,
     progress: Progress = silent,
@@ -238,6 +249,7 @@ def explain_gap(
     records : records of any kind except tables. Only a few dwells are used, and no feedback runs if
         there are open-loop runs.
     chain : the identified chain, one of the starts of the fit.
+    doubtful : further records, which are used if the laws of the catalogue follow them.
     catalogue : the effects that may be named.
     budget : time limit in s. If it is reached, the result is the best answer so far. By default
         the search ends by itself, and the answer does not depend on the machine.
@@ -247,7 +259,7 @@ def explain_gap(
     DataError : no record can be used.
     """
     notes: list[str] = []
-    interventions = find_interventions(records)
+    records, interventions = _what_to_use(records, doubtful, bench, chain, catalogue)
     runs = prepare(records, springs=bench.springs, interventions=interventions, notes=notes)
     training, held_out = split_holdout(runs, notes=notes)
     # If the longest run was cut in time, there is one run more than before.
@@ -280,6 +292,39 @@ def explain_gap(
             interventions=interventions,
             notes=(*notes, *_notes(search, budget)),
         )
+
+
+def _what_to_use(
+    records: Sequence[Record],
+    doubtful: Sequence[Record],
+    bench: Setup,
+    chain: Chain | None,
+    catalogue: Sequence[Effect],
+) -> tuple[list[Record], tuple[Intervention, ...]]:
+    """Return the records to use, and the stretches in which a hand acts.
+
+    Interventions and doubtful records are found with a linear chain. Those that the laws of the
+    catalogue follow are neither.
+    """
+    interventions = find_interventions(records)
+    springs, whole = bench.springs, partial(prepare, springs=bench.springs, notes=[])
+    asked = {one.experiment for one in interventions} | {record.id for record in doubtful}
+    if not asked or not catalogue:
+        return list(records), interventions
+    cut = whole(records, interventions=interventions)
+    uncut = {run.id: run for run in whole([*records, *doubtful]) if run.id in asked}
+    stretches = [one for one in interventions if one.experiment in uncut]
+    others = [record for record in doubtful if record.id in uncut]
+    windows = [(uncut[one.experiment], one.start, one.end) for one in stretches]
+    windows += [(uncut[one.id], float(one.t[0]), float(one.t[-1])) for one in others]
+    chains = [first_chain(cut, springs=springs), *([] if chain is None else [chain])]
+    with threadpool_limits(1, user_api="blas"):
+        followed_runs = follow(cut, catalogue, map)
+        model = start_all(followed_runs, springs=springs, chains=chains)
+        told = are_followed(windows, model, followed_runs)
+    known = {id(one) for one, fine in zip((*stretches, *others), told, strict=True) if fine}
+    used = [*records, *(record for record in doubtful if id(record) in known)]
+    return used, tuple(one for one in interventions if id(one) not in known)
 
 
 def _describe(search: Search, bench: Setup) -> Gap:

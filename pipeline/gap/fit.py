@@ -410,26 +410,33 @@ def holding_force(tables: Tables) -> Array:
 # ---------------------------------------------------------------- the linear chain, from nothing
 
 
+_EQUAL_MASSES = 1e-3  # weight, relative to the equations of motion
+
+
 def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:
     """Estimate masses, dampings and springs by modulating functions.
 
     Without any input the first mass is 1.
     """
+    from scipy.optimize import nnls  # takes a quarter of a second, so it is imported here
+
     n = len(springs) - 1
     rows = [j for j, there in enumerate(springs) if there]
     rows = rows[:1] if n == 1 else rows
     columns = 2 * n + len(rows)
     equations, sides = zip(*(_equations(run, rows) for run in runs), strict=True)
     A, b = np.concatenate(equations), np.concatenate(sides)
-    if not np.any(b):
-        # With free decays alone, forces are relative to the first mass.
-        A, b = np.vstack([A, np.zeros(columns)]), np.append(b, 0.0)
-        first = int(np.argmax(np.abs(A[:, :n]).max(axis=0) > 0.0))  # the first cart that moves
-        # The equation m_1 = 1 gets a large weight, because nothing else sets the scale.
-        A[-1, first] = b[-1] = 1e3 * float(np.abs(A[:, first]).max())
     scale = np.linalg.norm(A, axis=0)
     scale[scale == 0.0] = 1.0  # a cart that never moves keeps the smallest values
-    p = np.linalg.lstsq(A / scale, b, rcond=None)[0] / scale
+    A = A / scale
+    if not np.any(b):
+        # With free decays alone, forces are relative to the first mass. If each cart moves alone,
+        # nothing relates its mass to the others, so a small weight makes the masses equal.
+        first = int(np.argmax(np.any([run.free for run in runs], axis=0)))
+        weight = np.where(np.arange(n) == first, 1e3, _EQUAL_MASSES)
+        A = np.vstack([A, np.eye(n, columns) * weight[:, None]])
+        b = np.append(b, weight * scale[:n])
+    p = nnls(A, b)[0] / scale
     m = np.maximum(p[:n], 0.02 * max(1e-12, np.abs(p[:n]).max()))
     k = np.zeros(n + 1)
     k[rows] = np.maximum(p[2 * n :], 1e-3 * max(1e-12, np.abs(p[2 * n :]).max(initial=0.0)))

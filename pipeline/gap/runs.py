@@ -255,7 +255,9 @@ def _begins_at_rest(y: Array, u: Array, still: Array, sample_time: float) -> tup
         return at_rest, at_rest and in_place
     # An input that moves the carts at once was switched on with the first sample. If the input
     # changes too soon to tell, carts that rest at zero were not pushed before.
-    pushed = in_place and (quiet * sample_time > _HELD_STILL or bool(np.any(np.abs(y[:, 0]) > still)))
+    pushed = in_place and (
+        quiet * sample_time > _HELD_STILL or bool(np.any(np.abs(y[:, 0]) > still))
+    )
     return at_rest, at_rest and not pushed
 
 
@@ -413,22 +415,10 @@ _LEAST_MOTION = 8.0  # encoder steps; a smaller motion is not used
 _FEWEST, _SHORTEST = 50, 0.5  # samples, s
 
 
-def drop_left_out(
-    records: Sequence[Record], *, left_out: Sequence[Finding]
-) -> tuple[list[Record], list[str]]:
-    """Return the records that the identification used, and notes on those that it left out.
-
-    Raises
-    ------
-    DataError : every record is left out.
-    """
-    out = {one.experiment for one in left_out}
-    kept = [record for record in records if record.id not in out]
+def notes_left_out(left_out: Sequence[Finding]) -> list[str]:
+    """Return notes on the records that the identification left out."""
     reasons = group_messages((one.experiment, one.reason) for one in left_out)
-    notes = [phrases("gap").text("note_left_out", reason=reason) for reason in reasons]
-    if records and not kept:
-        raise DataError(f"gap: every recording is left out; {'; '.join(notes)}")
-    return kept, notes
+    return [phrases("gap").text("note_left_out", reason=reason) for reason in reasons]
 
 
 def prepare(

@@ -37,6 +37,7 @@ from pipeline.gap.pem.model import make_pem_run
 from pipeline.gap.runs import GapRun
 from pipeline.gap.types import Verdict
 from pipeline.plant.chain import Chain
+from pipeline.plant.effect import Effect
 from pipeline.words.phrases import phrases
 
 # ---------------------------------------------------------------------- the time limit
@@ -149,6 +150,45 @@ def _compliance(chain: Chain, run: GapRun, cart: int) -> Array:
 # ------------------------------------------------------ from the prediction-error fit to effects
 
 
+def follow(runs: Sequence[GapRun], catalogue: Iterable[Effect], mapper: Mapper) -> Records:
+    """Return the runs as the prediction-error fit follows them."""
+    return Records(
+        runs=tuple(make_pem_run(run) for run in runs),
+        mapper=mapper,
+        columns=frozenset().union(*(filled(effect) for effect in catalogue)),
+    )
+
+
+_FOLLOWED = 0.5  # gain; the motion before a window is then forgotten within it
+_AS_NOISE = 9.0  # largest mean square error in a window: three standard deviations
+# The noise is not measured yet. It may be up to twice the rounding of the encoder.
+_MOST_NOISE = 4.0
+_CHI_MEDIAN = 0.455  # median of a squared standard normal variable
+
+
+def are_followed(
+    windows: Sequence[tuple[GapRun, float, float]], model: PemFit, records: Records
+) -> list[bool]:
+    """Return for each window (run, start, end) whether the model follows it down to the noise.
+
+    No hand is then needed to explain its motion: the laws of the catalogue, driven by the measured
+    input, do. `model` was fitted to other runs or stretches.
+    """
+    runs = list(dict.fromkeys(run for run, _, _ in windows))
+    here = replace(records, runs=tuple(make_pem_run(run) for run in runs))
+    fresh = tuple(run.fresh() for run in here.runs)
+    left = here.evaluate(replace(model, own=fresh, gain=_FOLLOWED)).errors
+    usual = np.concatenate([e.ravel() for e in records.fit(model, gain=_FOLLOWED).errors])
+    noise = float(np.median(usual**2)) / _CHI_MEDIAN
+    most = _AS_NOISE * min(max(1.0, noise), _MOST_NOISE)
+    out = []
+    for run, start, end in windows:
+        t = here.runs[runs.index(run)].t
+        inside = left[runs.index(run)][:, (t >= start) & (t <= end)]
+        out.append(bool(inside.size and np.mean(inside**2) < most))
+    return out
+
+
 def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothesis]]:
     """Return the chosen hypothesis and all that were judged, the baseline first.
 
@@ -156,11 +196,7 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
     """
     found = [baseline]
     with suppress(OutOfTime):
-        records = Records(
-            runs=tuple(make_pem_run(run) for run in study.training),
-            mapper=study.mapper,
-            columns=frozenset().union(*(filled(effect) for effect in study.catalogue)),
-        )
+        records = follow(study.training, study.catalogue, study.mapper)
         chain = baseline.fit.structure.chain(baseline.fit.theta)
         own = first_chain(study.training, springs=study.springs)
         lean = choose_laws(
