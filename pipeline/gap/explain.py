@@ -45,6 +45,7 @@ from pipeline.plant.simulator.compiler import is_compiled, kept_in
 from pipeline.results import Analysis, Intervention, Record
 from pipeline.setup import Setup
 from pipeline.startup import with_one_thread
+from pipeline.submission.load import spring_names
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
 
@@ -269,10 +270,13 @@ def explain_gap(
         deadline = Deadline(mapper, seconds=budget)
         progress("fitting the linear chain")
         linear, training = fit_baseline(training, springs=bench.springs, start=chain, mapper=mapper)
+        springs = linear.structure.springs
+        notes += _notes_on_springs(bench.springs, springs)
+        bench = replace(bench, springs=springs)
         study = Study(
             training=(),
             held_out=tuple(held_out),
-            springs=bench.springs,
+            springs=springs,
             catalogue=tuple(catalogue),
             fitting=Fitting(mapper=mapper),
             progress=progress,
@@ -371,6 +375,13 @@ def _describe(search: Search, bench: Setup) -> Gap:
         measure_left=measure_left,
         contenders=() if settled else list_contenders(chosen, close or found),
     )
+
+
+def _notes_on_springs(stated: Sequence[bool], there: Sequence[bool]) -> list[str]:
+    """Return a note for each stated spring that the recordings do not show."""
+    names = spring_names(len(stated) - 1)
+    missing = [name for name, a, b in zip(names, stated, there, strict=True) if a and not b]
+    return [phrases("gap").text("note_no_spring", spring=name) for name in missing]
 
 
 def _notes(search: Search, budget: float | None) -> list[str]:

@@ -350,16 +350,20 @@ _BAD_RUN, _BAD_SHARE = 1.5, 2.0  # limits of a run's chi-square: absolute, and t
 _RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))
 
 
-def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
+def restart_runs(
+    fit: GapFit, runs: Sequence[GapRun], mapper: Mapper, *, usual: float | None = None
+) -> GapFit:
     """Restart the worst runs' nuisance parameters at other rest positions of the carts.
 
-    A cart may rest anywhere inside the band of friction or cogging, and its encoder is zeroed at
-    this rest. So the misfit of a run has several local minima over encoder zero and friction. The
-    shared parameters stay the same.
+    `usual` is the chi-square of a good run, by default the median of these runs. A cart may rest
+    anywhere inside the band of friction or cogging, and its encoder is zeroed at this rest. So the
+    misfit of a run has several local minima over encoder zero and friction. The shared parameters
+    stay the same.
     """
     if not fit.structure.many_rests:
         return fit
-    worst = fit.run_chi > max(_BAD_RUN, _BAD_SHARE * float(np.median(fit.run_chi)))
+    usual = float(np.median(fit.run_chi)) if usual is None else usual
+    worst = fit.run_chi > max(_BAD_RUN, _BAD_SHARE * usual)
     band = _rest_band(fit)
     rest = np.array(fit.structure.dry)
 
@@ -369,12 +373,17 @@ def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
 
     def starts(run: GapRun, own: Nuisance) -> Iterator[Nuisance]:
         free = np.array(run.free)
-        for shift, factor in _RESTARTS:
-            move = np.where(free, shift * band, 0.0)
+        moves = [(run.zero + shift * band, factor) for shift, factor in _RESTARTS]
+        if run.at_rest:  # the encoders were perhaps zeroed at the equilibrium of the springs
+            moves.append((run.start, 1.0))
+        for zero, factor in moves:
+            x0 = own.x0.copy()
+            if run.at_rest:
+                x0[0, : free.size] = np.where(free, run.start - zero, 0.0)
             yield Nuisance(
-                x0=own.x0 - np.append(move, np.zeros(move.size)) if run.at_rest else own.x0,
+                x0=x0,
                 v0=own.v0,
-                zero=np.where(free, run.zero, 0.0) + move,
+                zero=np.where(free, zero, 0.0),
                 scatter=np.where(rest & free, factor, 1.0),
             )
 
@@ -484,13 +493,18 @@ def _equations(run: GapRun, rows: Sequence[int]) -> tuple[Array, Array]:
     return A.reshape(-1, columns) / size, b.ravel() / size
 
 
+_NO_SPRING = 0.01  # share of the stiffest spring
+_AS_GOOD = 1.01  # times the cost
+
+
 def fit_baseline(
     runs: Sequence[GapRun], *, springs: Sequence[bool], start: Chain | None, mapper: Mapper = map
 ) -> tuple[GapFit, list[GapRun]]:
     """Fit the linear chain; return the fit and the runs with their measured noise.
 
     Short pieces, each with a start state, are fitted first, from two initial chains: the identified
-    one and an independent estimate. From the better result, whole runs are then fitted.
+    one and an independent estimate. From the better result, whole runs are then fitted. A spring
+    that ends at almost nothing is left out of the model, if the model fits as well without it.
     """
     structure = Structure(springs=tuple(springs))
     # In pieces of 0.6 s, a missing effect does little harm.
@@ -501,7 +515,15 @@ def fit_baseline(
     fits = [fit_model(structure.start(chain), shots, how) for chain in starts]
     best = min(fits, key=lambda fit: fit.cost)
     noisy = measure_noise(best, shots, runs)
-    return fit_model(best.without_nuisance, noisy, replace(how, iterations=25)), noisy
+    fit = fit_model(best.without_nuisance, noisy, replace(how, iterations=25))
+    k = fit.structure.chain(fit.theta).k
+    there = np.array(springs) & (k > _NO_SPRING * k.max())
+    if structure.n > 1 and not np.array_equal(there, springs):
+        lean = Structure(springs=tuple(there.tolist())).start(fit.structure.chain(fit.theta))
+        without = fit_model(lean, noisy, replace(how, iterations=25))
+        if without.cost < _AS_GOOD * fit.cost:
+            return without, noisy
+    return fit, noisy
 
 
 def measure_noise(fit: GapFit, shots: Sequence[GapRun], runs: Sequence[GapRun]) -> list[GapRun]:
@@ -531,11 +553,11 @@ def measure_noise(fit: GapFit, shots: Sequence[GapRun], runs: Sequence[GapRun]) 
 
 def fit_nuisance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> GapFit:
     """Fit only the nuisance parameters of runs to which the model was not fitted."""
-    how = Fitting(mapper=mapper, shared=False, iterations=10)
+    how = Fitting(mapper=mapper, shared=False, iterations=40, tolerance=1e-4)
     fresh = tuple(fresh_nuisance(run) for run in runs)
     found = fit_model(replace(fit, nuisance=fresh), runs, how)
     if fit.structure.many_rests and found.chi > fit.chi:
-        found = fit_model(restart_runs(found, runs, mapper), runs, how)
+        found = fit_model(restart_runs(found, runs, mapper, usual=fit.chi), runs, how)
     return found
 
 

@@ -350,6 +350,92 @@ def make_candidate(
     )
 
 
+# ------------------------------------------------------ the smallest model that explains as much
+#
+# A fit with many laws at once may leave crutches: laws that together imitate a part of another
+# law's effect. Once they are there, each of them seems needed. So a model is built again from
+# below. Its laws are fitted alone, then together, each time from a new start.
+
+_TRIED = 3  # effects to try beside those already chosen, in the order of their errors alone
+_TO_THE_END: dict[str, Any] = {"iterations": 40, "tolerance": 1e-5}
+
+
+def build_up(full: Hypothesis, baseline: Hypothesis, study: Study) -> list[Hypothesis]:
+    """Return models with some effects of `full`, each fitted from a new start, the chosen one last.
+
+    The chosen one is the smallest that leaves only noise. It is `full` if there is none. A rich law
+    is also tried in its simpler form.
+    """
+    effects = full.fit.structure.effects
+    parts = list(zip(effects, full.fit.terms, strict=True))
+    options = [(effect, term.values) for effect, term in parts]
+    for effect, term in parts:
+        if (plain := _simpler(effect, term.values)) is not None:
+            options.insert(0, plain)
+    chain = full.fit.structure.chain(full.fit.theta)
+    chains = [chain, baseline.fit.structure.chain(baseline.fit.theta)]
+    made: list[Hypothesis] = []
+
+    def is_enough(one: Hypothesis) -> bool:
+        return study.is_noise(one) and one.error < limits.NOTHING * full.error
+
+    def fitted(chosen: Sequence[tuple[Candidate, tuple[float, ...]]]) -> Hypothesis:
+        """Fit the chosen effects from new starts, and judge them."""
+        candidates = tuple(effect for effect, _ in chosen)
+        structure = Structure(springs=study.springs, effects=candidates)
+        values = [values for _, values in chosen]
+        best: Hypothesis | None = None
+        for start in chains:
+            one = judge(fit_free_run(structure.start(start, values), study), study)
+            best = one if best is None or one.fit.cost < best.fit.cost else best
+            if is_enough(best):
+                break
+        assert best is not None
+        made.append(best)
+        return best
+
+    def allowed(option: tuple[Candidate, Any], chosen: Sequence[tuple[Candidate, Any]]) -> bool:
+        mine = option[0]
+        return all(
+            mine.key != other.key
+            and (mine.place, mine.effect.family or mine.key)
+            != (other.place, other.effect.family or other.key)
+            for other, _ in chosen
+        )
+
+    alone = sorted(((fitted([option]), option) for option in options), key=lambda one: one[0].error)
+    best, first = alone[0]
+    chosen = [first]
+    ranked = [option for _, option in alone[1:]]
+    while not is_enough(best):
+        rest = [option for option in ranked if allowed(option, chosen)][:_TRIED]
+        if len(chosen) + 1 >= len(effects) or not rest:
+            return [*made, full]
+        trials = [(fitted([*chosen, option]), option) for option in rest]
+        best, added = min(trials, key=lambda one: one[0].error)
+        chosen = [*chosen, added]
+    as_small = [h for h in made if is_enough(h) and h.is_credible and len(h.key) == len(chosen)]
+    best = min(as_small, key=lambda h: h.bic_of_all, default=None)
+    return [*made, full] if best is None else [*(h for h in made if h is not best), best]
+
+
+def _simpler(
+    rich: Candidate, values: Sequence[float]
+) -> tuple[Candidate, tuple[float, ...]] | None:
+    """Return the simpler form of a rich law, with its values; None if it has none."""
+    if rich.effect.grows_from is None:
+        return None
+    effect = find_effect(rich.effect.grows_from)
+    at = [rich.effect.names.index(name) for name in effect.names]
+    plain = Candidate(
+        effect=effect,
+        place=rich.place,
+        signs=tuple(rich.signs[i] for i in at),
+        scales=tuple(rich.scales[i] for i in at),
+    )
+    return plain, tuple(values[i] for i in at)
+
+
 # ------------------------------------------------- needless effects, and the order of the others
 
 _FEW = 4  # effects to try at a time; certainty is only a rough guide to which are needed
@@ -488,6 +574,8 @@ def reach_verdict(
     baseline, chosen = steps[0], steps[-1]
     if not chosen.key:
         return ("none" if study.is_noise(chosen) else "unexplained"), steps, []
+    if study.explains(baseline) and chosen.error > limits.PARTIAL_GAIN * baseline.error:
+        return "none", steps[:1], []
     explained = study.explains(chosen)
     gain = baseline.bic - chosen.bic
     close = [

@@ -21,6 +21,7 @@ from pipeline.gap.judge import (
     Hypothesis,
     Study,
     as_model,
+    build_up,
     filled,
     finish,
     fit_free_run,
@@ -204,12 +205,17 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
         )
         if not lean.laws.groups():
             return baseline, found
-        found.append(judge(fit_free_run(_as_model(lean, study, records), study), study))
-        study.progress(f"{found[-1].size} laws remain: error {found[-1].error:.1%}")
+        full = judge(fit_free_run(_as_model(lean, study, records), study), study)
+        study.progress(f"{full.size} laws remain: error {full.error:.1%}")
+        found += build_up(full, baseline, study) if study.explains(full) else [full]
+        smallest = found[-1]
+        lean = _restricted(lean, smallest, records)
         _judge_rivals(rivals_of(lean, records), found, study, records)
         found[1:] = [h for h in found[1:] if np.isfinite(h.error)]
+        # More effects than the smallest model has would only be crutches.
+        few = [h for h in found if len(h.key) <= max(len(smallest.key), 1)]
         # An effect with a parameter at its bound is often not real, so it is removed.
-        chosen = prune(min(found, key=lambda h: h.bic_of_all), study, found)
+        chosen = prune(min(few, key=lambda h: h.bic_of_all), study, found)
         sound = [h for h in found if h.is_credible and np.isfinite(h.error)]
         if not chosen.is_credible:
             chosen = prune(min(sound, key=lambda h: h.bic_of_all), study, found)
@@ -218,6 +224,17 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
     found = [h for h in found if np.isfinite(h.error) and h.is_credible]
     worth = [h for h in found if worth_it(h, baseline, study)]
     return min(worth, key=lambda h: h.bic, default=baseline), found
+
+
+def _restricted(lean: PemFit, model: Hypothesis, records: Records) -> PemFit:
+    """Return the fit with only the laws that fill columns of the model's effects."""
+    kept = {(c.place, column) for c in model.fit.structure.effects for column in filled(c.effect)}
+    gone = [
+        group
+        for group in lean.laws.groups()
+        if not {(place, column) for place, column in lean.laws.filled(group)} & kept
+    ]
+    return records.refit(lean, *lean.laws.without(lean.p, gone)) if gone else lean
 
 
 def _judge_rivals(

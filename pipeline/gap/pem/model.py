@@ -271,6 +271,14 @@ class LawSet:
         o = self.first[group]
         return np.arange(o, o + SIZES[self.keys[group][0]])
 
+    def filled(self, group: int) -> set[tuple[int, Column]]:
+        """Return the places, as in the catalogue, and the columns that a group fills there."""
+        if group < 0:
+            return {(0, column) for column in column_set([DRIVE_COLUMNS[-1 - group]])}
+        kind, at = self.keys[group]
+        place = 0 if CATALOGUE[kind].place == "input" else at + 1
+        return {(place, column) for column in column_set(COLUMNS[kind])}
+
     def neutral(self) -> Array:
         """Return the neutral values of the vector, 0 except for the input limit."""
         out = np.zeros(self.size)
