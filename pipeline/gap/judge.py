@@ -572,10 +572,11 @@ def reach_verdict(
     about as well. Otherwise the last step is withdrawn if rivals dispute its effect.
     """
     baseline, chosen = steps[0], steps[-1]
-    if not chosen.key:
-        return ("none" if study.is_noise(chosen) else "unexplained"), steps, []
+    # A sufficient linear model stays, unless the effects lower its error by a tenth.
     if study.explains(baseline) and chosen.error > limits.PARTIAL_GAIN * baseline.error:
         return "none", steps[:1], []
+    if not chosen.key:
+        return "unexplained", steps, []
     explained = study.explains(chosen)
     gain = baseline.bic - chosen.bic
     close = [

@@ -37,8 +37,10 @@ from pipeline.gap.pem.fit import PemFit, Records, choose_laws, rivals_of
 from pipeline.gap.pem.model import make_pem_run
 from pipeline.gap.runs import GapRun
 from pipeline.gap.types import Verdict
+from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import Effect
+from pipeline.words.numbers import listing
 from pipeline.words.phrases import phrases
 
 # ---------------------------------------------------------------------- the time limit
@@ -333,7 +335,7 @@ class Search:
 
     def reach_verdict(self) -> None:
         """Complete the chosen fit, and set the verdict."""
-        study = self.study
+        study, tried = self.study, self.path[-1]
         sample_time = max(run.record.sample_time for run in study.training)
         while True:
             self.verdict, self.path, self.close = reach_verdict(
@@ -354,6 +356,11 @@ class Search:
         self.path = (*self.path[:-1], self.chosen)
         if self.verdict == "named" and not study.explains(self.chosen):
             self.verdict = "partial"
+        if self.verdict == "none" and tried.key:
+            titles = [find_effect(key).title.lower() for key, _ in sorted(tried.key)]
+            errors = {"before": f"{self.path[0].error:.3%}", "after": f"{tried.error:.3%}"}
+            hint = phrases("gap").text("note_hint", effects=listing(titles), **errors)
+            self.notes.append(hint)
 
     # ------------------------------------------------------------------- judged runs
 
@@ -375,7 +382,11 @@ class Search:
     def _look(self, study: Study) -> tuple[Hypothesis, list[Hypothesis]]:
         """Return the chosen hypothesis and all that were judged in time, the linear one first."""
         baseline = judge(self.linear, study)
-        if baseline.at_floor or baseline.error < limits.AS_REPEATS * study.repeatability:
+        # If the error is this small, no effect could lower it by a tenth.
+        quiet = limits.PARTIAL_GAIN * baseline.error < study.floor
+        quiet = quiet and baseline.fit.chi < limits.NEAR_FLOOR**2
+        as_repeats = baseline.error < limits.AS_REPEATS * study.repeatability
+        if baseline.at_floor or quiet or as_repeats:
             return baseline, [baseline]
         study.progress(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
         return find_hypotheses(baseline, self._timed(study))

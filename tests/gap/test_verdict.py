@@ -87,3 +87,14 @@ def test_held_out_runs_are_evidence_too(held: float, verdict: str):
     drag = hypothesis(DRAG, error=0.01, bic=-1000)
     cubic = hypothesis(CUBIC, error=0.01, bic=-970, held=held)
     assert verdict_on(drag, others=(cubic,))[0] == verdict
+
+
+@pytest.mark.parametrize(("after", "verdict"), [(0.0149, "none"), (0.011, "named")])
+def test_a_sufficient_linear_model_needs_no_effect(after, verdict):
+    """Where the linear model is near the noise, an effect must lower the error by a tenth."""
+    near = hypothesis(error=0.015, bic=0.0)
+    child = hypothesis(CUBIC, error=after, bic=-400)
+
+    said, path, _ = reach_verdict((near, child), [near, child], study=STUDY, sample_time=0.01)
+
+    assert (said, len(path)) == (verdict, 1 if verdict == "none" else 2)
