@@ -563,15 +563,22 @@ def steps_to(
 
 
 def reach_verdict(
-    steps: tuple[Hypothesis, ...], found: Sequence[Hypothesis], *, study: Study, sample_time: float
+    steps: tuple[Hypothesis, ...],
+    found: Sequence[Hypothesis],
+    *,
+    study: Study,
+    sample_time: float,
+    best: Hypothesis | None = None,
 ) -> tuple[Verdict, tuple[Hypothesis, ...], list[Hypothesis]]:
     """Return the verdict, the accepted steps, and the rivals if the verdict is `ambiguous`.
 
     `steps` lead from the linear model to the chosen one; `found` are all hypotheses judged. If a
     large error remains, two more rules apply. An effect is dropped if a hypothesis without it does
-    about as well. Otherwise the last step is withdrawn if rivals dispute its effect.
+    about as well as the `best` one, by default the chosen one; losses add up. Otherwise the last
+    step is withdrawn if rivals dispute its effect.
     """
     baseline, chosen = steps[0], steps[-1]
+    best = best or chosen
     # A sufficient linear model stays, unless the effects lower its error by a tenth.
     if study.explains(baseline) and chosen.error > limits.PARTIAL_GAIN * baseline.error:
         return "none", steps[:1], []
@@ -590,20 +597,23 @@ def reach_verdict(
         and (explained or not _same_kind(rival, chosen))
     ]
     if not explained:
-        without = _needless(chosen, [*found, *steps], study)
+        without = _needless(chosen, [*found, *steps], study, best=best)
         disputed = bool(close) and chosen.error > limits.MOSTLY * baseline.error
         if without is not None or disputed:
             back = steps[:-1] if without is None else steps_to(without, [*found, *steps], study)
-            return reach_verdict(back, found, study=study, sample_time=sample_time)
+            best = None if without is None else min(best, without, key=lambda h: h.error)
+            return reach_verdict(back, found, study=study, sample_time=sample_time, best=best)
     if close:
         return "ambiguous", steps, close
     return ("named" if explained else "partial"), steps, []
 
 
-def _needless(chosen: Hypothesis, found: Sequence[Hypothesis], study: Study) -> Hypothesis | None:
-    """Return the best hypothesis without one of the effects, if that effect helps too little."""
+def _needless(
+    chosen: Hypothesis, found: Sequence[Hypothesis], study: Study, *, best: Hypothesis
+) -> Hypothesis | None:
+    """Return the best hypothesis without one of the effects, if it is about as good as `best`."""
     smaller = [h for h in found if h.key < chosen.key and len(h.key) == len(chosen.key) - 1]
-    as_good = [h for h in smaller if not lowers_error(chosen, h, study)]
+    as_good = [h for h in smaller if not lowers_error(best, h, study)]
     return min(as_good, key=lambda h: h.error, default=None)
 
 
