@@ -580,10 +580,11 @@ def reach_verdict(
     baseline, chosen = steps[0], steps[-1]
     best = best or chosen
     # A sufficient linear model stays, unless the effects lower its error by a tenth.
-    if study.explains(baseline) and chosen.error > limits.PARTIAL_GAIN * baseline.error:
+    sufficient = baseline.error <= limits.ENOUGH_NOISE * study.floor
+    if sufficient and chosen.error > limits.PARTIAL_GAIN * baseline.error:
         return "none", steps[:1], []
     if not chosen.key:
-        return "unexplained", steps, []
+        return ("none" if study.is_noise(chosen) else "unexplained"), steps, []
     explained = study.explains(chosen)
     gain = baseline.bic - chosen.bic
     close = [
