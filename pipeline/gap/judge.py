@@ -363,8 +363,8 @@ _TO_THE_END: dict[str, Any] = {"iterations": 40, "tolerance": 1e-5}
 def build_up(full: Hypothesis, baseline: Hypothesis, study: Study) -> list[Hypothesis]:
     """Return models with some effects of `full`, each fitted from a new start, the chosen one last.
 
-    The chosen one is the smallest that leaves only noise. It is `full` if there is none. A rich law
-    is also tried in its simpler form.
+    The chosen one is the smallest that leaves only noise, or else `full`. A rich law is also tried
+    in its simpler form.
     """
     effects = full.fit.structure.effects
     parts = list(zip(effects, full.fit.terms, strict=True))
@@ -422,7 +422,7 @@ def build_up(full: Hypothesis, baseline: Hypothesis, study: Study) -> list[Hypot
 def _simpler(
     rich: Candidate, values: Sequence[float]
 ) -> tuple[Candidate, tuple[float, ...]] | None:
-    """Return the simpler form of a rich law, with its values; None if it has none."""
+    """Return the simpler form of a rich law, with its values; None for a plain law."""
     if rich.effect.grows_from is None:
         return None
     effect = find_effect(rich.effect.grows_from)

@@ -1,4 +1,4 @@
-"""What is said about a bench holds: no crutches, no false hands, no springs that do not exist."""
+"""A search reports no crutches, no false hands, and no springs that do not exist."""
 
 from dataclasses import replace
 
@@ -131,7 +131,7 @@ def test_decays_of_single_carts_are_explained_by_a_linear_chain():
 
 
 def test_a_large_lag_is_no_hand():
-    """What a linear chain takes for hands is followed by the laws of the catalogue."""
+    """A lag is no hand, although the force balance of a linear chain fails in the same way."""
     slow = Hidden(effect="actuator_lag", parameters={"time_constant": 0.12})
     case = make_case(seed=9, n=1, effects=[slow], rate=200.0)
     assert find_interventions(case.records)
