@@ -42,13 +42,14 @@ def test_steps_that_begin_with_their_input_show_delay_and_lag(hidden):
     assert (gap.verdict, [f.effect.key for f in gap.effects]) == ("named", [hidden.effect])
     ((name, true),) = hidden.parameters.items()
     found = gap.effects[0].parameters[name]
+    assert found.std is not None
     # The truth's own steps are 0.2 ms long.
     assert found.value == pytest.approx(float(true), abs=4.0 * found.std + 2e-5)
 
 
 def steady(y: float, u: list[float]) -> Record:
     """Return a record of a cart that rests at `y` and moves after half a second at the latest."""
-    t = np.arange(200) * 0.01
+    t = np.asarray(np.arange(200) * 0.01, dtype=np.float64)
     moved = np.where(t > 0.52, np.sin(8.0 * (t - 0.52)), 0.0)
     values = np.interp(t, [0.0, 0.5, 0.51, 2.0], u)
     return Record(
@@ -101,7 +102,8 @@ def test_a_part_of_a_record_keeps_the_earlier_input():
 def test_decays_of_single_carts_are_explained_by_a_linear_chain():
     """If each cart was released alone, nothing relates the masses, and no effect is missing."""
     m, c = np.array([5.3e-3, 1.33e-3]), np.array([1.87e-3, 2.9e-3])
-    k, t = np.array([0.386, 0.337, 0.487]), np.arange(2000) * 0.005
+    k = np.array([0.386, 0.337, 0.487])
+    t = np.asarray(np.arange(2000) * 0.005, dtype=np.float64)
     rng, records = np.random.default_rng(3), []
     for cart in (1, 2):
         for trial in (1, 2):
