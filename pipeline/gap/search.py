@@ -177,18 +177,20 @@ def are_followed(
     No hand is then needed to explain its motion: the laws of the catalogue, driven by the measured
     input, do. `model` was fitted to other runs or stretches.
     """
-    runs = list(dict.fromkeys(run for run, _, _ in windows))
-    here = replace(records, runs=tuple(make_pem_run(run) for run in runs))
-    fresh = tuple(run.fresh() for run in here.runs)
-    left = here.evaluate(replace(model, own=fresh, gain=_FOLLOWED)).errors
-    usual = np.concatenate([e.ravel() for e in records.fit(model, gain=_FOLLOWED).errors])
+    model = records.fit(model, gain=_FOLLOWED)
+    if not np.isfinite(model.cost):
+        return [False] * len(windows)
+    usual = np.concatenate([errors.ravel() for errors in model.errors])
     noise = float(np.median(usual**2)) / _CHI_MEDIAN
     most = _AS_NOISE * min(max(1.0, noise), _MOST_NOISE)
     out = []
     for run, start, end in windows:
-        t = here.runs[runs.index(run)].t
-        inside = left[runs.index(run)][:, (t >= start) & (t <= end)]
-        out.append(bool(inside.size and np.mean(inside**2) < most))
+        track = make_pem_run(run)
+        alone = replace(records, runs=(track,)).evaluate(replace(model, own=(track.fresh(),)))
+        inside = (track.t >= start) & (track.t <= end)
+        if fine := bool(np.isfinite(alone.cost) and inside.any()):
+            fine = bool(np.mean(alone.errors[0][:, inside] ** 2) < most)
+        out.append(fine)
     return out
 
 
@@ -208,9 +210,11 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
         if not lean.laws.groups():
             return baseline, found
         full = judge(fit_free_run(_as_model(lean, study, records), study), study)
+        found.append(full)
         study.progress(f"{full.size} laws remain: error {full.error:.1%}")
-        found += build_up(full, baseline, study) if study.explains(full) else [full]
-        smallest = found[-1]
+        made = build_up(full, baseline, study) if study.explains(full) else [full]
+        found += [h for h in made if h is not full]
+        smallest = made[-1]
         lean = _restricted(lean, smallest, records)
         _judge_rivals(rivals_of(lean, records), found, study, records)
         found[1:] = [h for h in found[1:] if np.isfinite(h.error)]

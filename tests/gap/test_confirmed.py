@@ -9,7 +9,9 @@ from pipeline.estimation.force_balance import find_interventions
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit import evaluate, restart_runs
 from pipeline.gap.judge import build_up, fit_free_run, judge, make_candidate
+from pipeline.gap.pem.fit import start_all
 from pipeline.gap.runs import make_run, split_holdout
+from pipeline.gap.search import OutOfTime, are_followed, find_hypotheses, follow
 from pipeline.plant.catalogue import find_effect
 from pipeline.results import Record
 from pipeline.setup import Setup
@@ -154,6 +156,43 @@ def test_a_stated_spring_that_does_not_exist_is_left_out():
     assert gap.verdict == "none"
     assert gap.bench.springs == case.springs
     assert any("wall-1" in note for note in gap.notes)
+
+
+def test_only_a_motion_that_the_laws_give_is_followed():
+    """A run is followed, a run with a hand in it is not, and nothing is if the model diverges."""
+    fit, study = begun(rate=113.1)
+    largest, own, *rest = study.training
+    others = [largest, *rest]
+    records = follow(others, study.catalogue, map)
+    chains = [fit.structure.chain(fit.theta)]
+    model = start_all(records, springs=study.springs, chains=chains)
+    push = np.where((own.t > 1.0) & (own.t < 1.3), 0.3 * np.sin(10.0 * np.pi * (own.t - 1.0)), 0.0)
+    touched = replace(own, y=own.y + push)
+    unstable = replace(model, p=np.where(np.arange(model.p.size) == 1, -10.0, model.p))
+
+    assert are_followed([(own, 0.9, 1.4), (touched, 0.9, 1.4)], model, records) == [True, False]
+    assert are_followed([(own, 0.9, 1.4)], unstable, records) == [False]
+
+
+@pytest.mark.parametrize("calls", [0, 3, 6, 12, 1000])
+def test_an_answer_in_hand_is_kept_when_the_time_is_up(calls):
+    """If the time is up while effects are confirmed, the model with all effects is the answer."""
+    fit, study = begun(LAG, rate=113.1)
+    done = 0
+
+    def until(work, *items):
+        nonlocal done
+        done += 1
+        if done > calls:
+            raise OutOfTime
+        return map(work, *items)
+
+    hurried = replace(study, fitting=replace(study.fitting, mapper=until))
+    chosen, found = find_hypotheses(judge(fit, study), hurried)
+
+    assert chosen in found
+    assert bool(chosen.key) == any(len(h.key) > 0 for h in found)
+    assert calls < 1000 or chosen.key == {("actuator_lag", 0)}
 
 
 # ------------------------------------------------------------- the smallest model, to its end
