@@ -493,7 +493,8 @@ def _equations(run: GapRun, rows: Sequence[int]) -> tuple[Array, Array]:
     return A.reshape(-1, columns) / size, b.ravel() / size
 
 
-_NO_SPRING = 0.01  # share of the stiffest spring
+# Shares of the stiffest spring: below the first, a spring may not exist; with the second, it does.
+_NO_SPRING, _A_SPRING = 0.01, 0.1
 _AS_GOOD = 1.01  # times the cost
 
 
@@ -516,14 +517,18 @@ def fit_baseline(
     best = min(fits, key=lambda fit: fit.cost)
     noisy = measure_noise(best, shots, runs)
     fit = fit_model(best.without_nuisance, noisy, replace(how, iterations=25))
-    k = fit.structure.chain(fit.theta).k
-    there = np.array(springs) & (k > _NO_SPRING * k.max())
-    if structure.n > 1 and not np.array_equal(there, springs):
-        lean = Structure(springs=tuple(there.tolist())).start(fit.structure.chain(fit.theta))
-        without = fit_model(lean, noisy, replace(how, iterations=25))
-        if without.cost < _AS_GOOD * fit.cost:
-            return without, noisy
-    return fit, noisy
+    chain = fit.structure.chain(fit.theta)
+    missing = np.array(springs) & (chain.k < _NO_SPRING * chain.k.max())
+    if structure.n == 1 or not missing.any():
+        return fit, noisy
+    # If the recordings say nothing about a spring, it stays where it is put.
+    stiff = replace(chain, k=np.where(missing, _A_SPRING * chain.k.max(), chain.k))
+    again = fit_model(structure.start(stiff), noisy, replace(how, iterations=40))
+    k = again.structure.chain(again.theta).k
+    missing &= k < _NO_SPRING * k.max()
+    lean = Structure(springs=tuple((np.array(springs) & ~missing).tolist())).start(chain)
+    without = fit_model(lean, noisy, replace(how, iterations=25)) if missing.any() else fit
+    return (without if without.cost < _AS_GOOD * fit.cost else fit), noisy
 
 
 def measure_noise(fit: GapFit, shots: Sequence[GapRun], runs: Sequence[GapRun]) -> list[GapRun]:

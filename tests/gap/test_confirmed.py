@@ -127,6 +127,7 @@ def test_decays_of_single_carts_are_explained_by_a_linear_chain():
     assert gap.verdict == "none"
     assert gap.final == pytest.approx(gap.noise_floor, rel=0.1)
     chain = gap.model.chain
+    assert gap.bench.springs == (True, True, True)  # a spring that nothing determines stays
     own = (chain.k[:-1] + chain.k[1:]) / chain.m
     np.testing.assert_allclose(own, (k[:-1] + k[1:]) / m, rtol=1e-3)
 
