@@ -93,9 +93,9 @@ def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:
     """Return what a sufficient linear model covers, and how large a hidden effect could be."""
     repeats = AS_REPEATS * (gap.repeatability or 0.0)
     noise = float(np.sqrt(AT_FLOOR)) * gap.noise_floor
-    # The search for effects begins only when the error exceeds both limits. Errors of noise and of
-    # a hidden effect add as squares.
-    hidden = float(np.sqrt(max(noise, repeats) ** 2 - gap.noise_floor**2))
+    # The search for effects begins only when the error exceeds both limits, and may find nothing
+    # that lowers it. Errors of noise and of a hidden effect add as squares.
+    hidden = float(np.sqrt(max(noise, repeats, gap.baseline) ** 2 - gap.noise_floor**2))
     lost = WORDS.text("lost_in_repeats" if repeats > noise else "lost_in_noise")
     blocks: list[Block] = [
         paragraph(WORDS.spans("none_hidden", share=share(hidden), lost=lost)),
