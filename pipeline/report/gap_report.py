@@ -84,11 +84,11 @@ def make_gap_files(
 def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = silent) -> Document:
     """Return the gap report; sections with nothing to show are left out."""
     page = Page(analysis)
-    worst = _worst_first(gap)
+    telling = _telling_first(gap)
     forces = residual_forces(gap, free={record.id: record.free for record in analysis.records})
     where = WORDS.text("where_enough" if gap.verdict == "none" else "where_fails")
     parts: list[Part] = [
-        ("summary", verdict_title(gap), lambda page: _summary(page, gap, worst[:1])),
+        ("summary", verdict_title(gap), lambda page: _summary(page, gap, telling[:1])),
         ("where", where, lambda page: _where(page, gap)),
     ]
     for i, found in enumerate(gap.effects):
@@ -107,7 +107,7 @@ def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = sil
         )
     made = WORDS.text("made" if gap.complete else "made_so_far", version=__version__)
     parts += [
-        ("runs", "Measured against simulated", lambda page: _runs(page, gap, worst[1:])),
+        ("runs", "Measured against simulated", lambda page: _runs(page, gap, telling[1:])),
         ("force-left", "The unexplained force", lambda page: _force_left(page, gap)),
         ("hands", WORDS.text("hands"), lambda page: _interventions(page, gap)),
         ("apart", "How to decide between the explanations", lambda page: _apart(page, gap)),
@@ -125,8 +125,8 @@ def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = sil
 # --------------------------------------------------------------------- the page
 
 
-def _summary(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
-    pictures = [before_after_picture(page, gap, trace, number=1) for trace in worst]
+def _summary(page: Page, gap: Gap, shown: Sequence[Trace]) -> list[Block]:
+    pictures = [before_after_picture(page, gap, trace, number=1) for trace in shown]
     return _verdict(page, gap, shown=pictures)
 
 
@@ -264,10 +264,10 @@ def _evidence(
 # --------------------------------------------------------------- runs and rivals
 
 
-def _runs(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
+def _runs(page: Page, gap: Gap, shown: Sequence[Trace]) -> list[Block]:
     blocks = [
         before_after_picture(page, gap, trace, number=i)
-        for i, trace in enumerate(worst[:_MORE_TRACES], start=2)
+        for i, trace in enumerate(shown[:_MORE_TRACES], start=2)
     ]
     if gap.left and gap.effects:
         blocks.append(window_table(page, gap.left, model=whole_model(gap)))
@@ -448,20 +448,20 @@ def _method(gap: Gap) -> list[Block]:
     return [paragraph(method), runs, *remarks(list(gap.notes))]
 
 
-def _worst_first(gap: Gap) -> list[Trace]:
-    """Return the worst trace of each held-out run; the worst of all comes first.
+def _telling_first(gap: Gap) -> list[Trace]:
+    """Return one trace of each held-out run; the one in which the effects act most comes first.
 
-    The worst trace is the one with the linear model's largest error.
+    There, they lower the error most. Without effects, the trace with the largest error comes first.
     """
 
-    def size(trace: Trace) -> float:
+    def gain(trace: Trace) -> tuple[float, float]:
         row = _row(gap, trace)
-        return row.baseline if row else 0.0
+        return (row.baseline - row.final, row.baseline) if row else (0.0, 0.0)
 
-    # In ascending order, so that the trace with the largest error of each run is kept.
-    held_out = sorted((trace for trace in gap.traces if trace.held_out), key=size)
-    worst = {trace.experiment: trace for trace in held_out}
-    return sorted(worst.values(), key=size, reverse=True)
+    # In ascending order, so that the most telling trace of each run is kept.
+    held_out = sorted((trace for trace in gap.traces if trace.held_out), key=gain)
+    telling = {trace.experiment: trace for trace in held_out}
+    return sorted(telling.values(), key=gain, reverse=True)
 
 
 def _row(gap: Gap, trace: Trace) -> RecordGap | None:

@@ -37,7 +37,12 @@ from pipeline.report.equations.model import augmented_equations, in_order, law
 from pipeline.report.figures.gap import predicted_figure
 from pipeline.report.files import write_files
 from pipeline.report.gap_files import with_gap
-from pipeline.report.gap_report import LEGEND, build_gap_document, make_gap_files
+from pipeline.report.gap_report import (
+    LEGEND,
+    _telling_first,
+    build_gap_document,
+    make_gap_files,
+)
 from pipeline.report.gap_verdict import WORDS, added_name, kept_together, share, terminal_verdict
 from pipeline.report.html import render_html
 from pipeline.report.lab_report import build_document
@@ -153,6 +158,39 @@ def test_the_verdict_none_says_what_it_covers():
     assert "0.0500 V" in said
     # A search begins at a chi-square of 1.15 per point. With noise of 3 %: 3 % √(1.15 - 1) = 1.2 %.
     assert re.search(r"1\.2 %", said)
+
+
+@pytest.mark.parametrize(
+    ("errors", "shown"),
+    [
+        # The linear model is worst in step-a, but there the effects change little.
+        (
+            {("step-a", 1): (0.9, 0.85), ("step-b", 1): (0.2, 0.15), ("step-b", 2): (0.5, 0.1)},
+            [("step-b", 2), ("step-a", 1)],
+        ),
+        # Without effects, or if they make it worse, nothing is gained anywhere.
+        ({("step-a", 1): (0.2, 0.2), ("step-b", 1): (0.9, 0.9)}, [("step-b", 1), ("step-a", 1)]),
+        ({("step-a", 1): (0.2, 0.3), ("step-b", 1): (0.3, 0.3)}, [("step-b", 1), ("step-a", 1)]),
+    ],
+)
+def test_the_run_shown_first_is_one_in_which_the_effects_act(errors, shown):
+    """Of each held-out run, the cart is shown whose error falls most; the best run comes first."""
+    gap = make_gap()
+    (trace, *_), (row, *_) = gap.traces, gap.by_record
+    gap = replace(
+        gap,
+        traces=tuple(replace(trace, experiment=run, cart=cart) for run, cart in errors),
+        by_record=tuple(
+            replace(row, experiment=run, cart=cart, baseline=before, final=after)
+            for (run, cart), (before, after) in errors.items()
+        ),
+    )
+
+    found = _telling_first(gap)
+
+    assert [(one.experiment, one.cart) for one in found] == shown
+    first = pictures(sections(build_gap_document(gap, two_cart_analysis()))["summary"].blocks)
+    assert f"Cart {shown[0][1]} in {shown[0][0]}" in plain(first["before-after-1"].caption)
 
 
 def test_the_unexplained_force_has_a_figure_and_a_formula():
