@@ -22,6 +22,7 @@ from pipeline.errors import DataError, PipelineError
 from pipeline.experiments import propose
 from pipeline.experiments.information import sampled_input
 from pipeline.experiments.plan import PlanLimits, Recording
+from pipeline.gap.advice import advised
 from pipeline.gap.limits import CLOSE_BIC, THINNING
 from pipeline.gap.types import Gap, Prediction, Proposal
 from pipeline.plant.augmented import rest_positions, simulate_augmented
@@ -77,7 +78,8 @@ def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording
     because plan.toml is broken, a note says why.
     """
     try:
-        return with_proposal(gap, limits=propose.current_plan(submission).limits, without=without)
+        limits = propose.current_plan(submission).limits
+        return advised(with_proposal(gap, limits=limits, without=without))
     except PipelineError as error:
         return replace(gap, notes=(*gap.notes, f"no recording is proposed: {error}"))
 

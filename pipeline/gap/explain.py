@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.errors import DataError
 from pipeline.estimation.force_balance import find_interventions
+from pipeline.gap.advice import advised
 from pipeline.gap.fit import Fitting, GapFit, Mapper, first_chain, fit_baseline
 from pipeline.gap.judge import Study
 from pipeline.gap.pem.fit import start_all
@@ -26,7 +27,6 @@ from pipeline.gap.search import Deadline, Search, are_followed, follow
 from pipeline.gap.summary import (
     chain_covariance,
     chain_std,
-    choose_experiment,
     compare_by_record,
     find_windows,
     free_runs,
@@ -217,12 +217,12 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
     explain = partial(explain_gap, records, analysis.bench, chain=start, progress=progress)
     if analysis.lacks_springs:
         gap = explain(catalogue=(), budget=budget)
-        gap = replace(gap, residual=(), contenders=(), next_experiment="")
+        gap = replace(gap, residual=(), contenders=())
     else:
         gap = explain(doubtful=doubtful, budget=budget)
     used = {*gap.training, *gap.held_out}
     left_out = tuple(one for one in analysis.left_out if one.experiment not in used)
-    return replace(
+    gap = replace(
         gap,
         title=analysis.title,
         provenance=analysis.provenance,
@@ -231,6 +231,7 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
         causes=tuple(c for c in analysis.causes if not c.run or c.run in used),
         notes=(*notes_left_out(left_out), *gap.notes),
     )
+    return advised(gap)
 
 
 def explain_gap(
@@ -290,12 +291,13 @@ def explain_gap(
         search.add_constant_force()
         search.reach_verdict()
         zeros = {run.id: own.zero for run, own in search.judged}
-        return replace(
+        gap = replace(
             _describe(search, bench),
             free_run=free_runs(search.final, runs, zeros),
             interventions=interventions,
             notes=(*notes, *_notes(search, budget)),
         )
+    return advised(gap)
 
 
 def _what_to_use(
@@ -348,7 +350,6 @@ def _describe(search: Search, bench: Setup) -> Gap:
     measure_left = cache(
         partial(windowed_residual_forces, final, *zip(*search.judged, strict=True))
     )
-    repeated = study.repeatability > 0
     return Gap(
         bench=bench,
         verdict=verdict,
@@ -360,7 +361,6 @@ def _describe(search: Search, bench: Setup) -> Gap:
         repeatability=study.repeatability or None,
         by_record=compare_by_record(traces, study),
         where=find_windows(path[0].fit, study.training) if verdict != "none" else (),
-        next_experiment=choose_experiment(verdict, chosen, close, left, repeated=repeated),
         linear=path[0].fit.structure.model(path[0].fit.theta),
         model=replace(model, terms=_in_order(model.terms, effects)),
         training=tuple(dict.fromkeys(run.id for run in study.training)),

@@ -21,12 +21,10 @@ from pipeline.gap.types import (
     NamedValue,
     RecordGap,
     Trace,
-    Verdict,
 )
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.effect import EffectTerm
 from pipeline.setup import Units
-from pipeline.words.phrases import phrases
 
 # ------------------------------------------------------------ one simulation over a whole record
 
@@ -53,17 +51,6 @@ def free_runs(
 
 
 # ------------------------------------------------------------ where a run departs from the model
-
-# For each behaviour of the cart: the key of the sentence on the recording that shows more of it.
-_SHOWS = {
-    "velocity near zero": "show_rest",
-    "fast motion": "show_motion",
-    "large displacement, positive side": "show_displacement",
-    "large displacement, negative side": "show_displacement",
-    "after an edge of the input": "show_edges",
-    "input on": "show_drive",
-    "input off": "show_motion",
-}
 
 
 def find_windows(fit: GapFit, runs: Sequence[GapRun]) -> tuple[GapWindow, ...]:
@@ -126,31 +113,6 @@ def _what(run: GapRun, x: Array, energy: Array) -> str:
             if excess > score:
                 best, score = what, excess
     return best
-
-
-def choose_experiment(
-    verdict: Verdict,
-    chosen: Hypothesis,
-    close: Sequence[Hypothesis],
-    left: Sequence[GapWindow],
-    *,
-    repeated: bool,
-) -> str:
-    """Return advice on the next recording, for example how to decide between two effects.
-
-    `left` are the windows in which the chosen model fits badly, the worst first. `repeated` is
-    true if some runs have the same input, so that their scatter is known.
-    """
-    if verdict == "ambiguous":
-        texts = {find_effect(key).deciding_run for key, _ in chosen.key ^ close[0].key}
-        return " ".join(sorted(texts))
-    if verdict == "named":
-        return chosen.fit.structure.effects[-1].effect.deciding_run
-    if verdict == "none":
-        return ""
-    words = phrases("gap")
-    shows = words.text(next((_SHOWS[w.what] for w in left if w.what in _SHOWS), "show_motion"))
-    return shows if repeated else f"{words.text('repeat_runs')} {shows}"
 
 
 # -------------------------------------------------------------------- effects, rivals and traces

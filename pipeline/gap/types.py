@@ -10,7 +10,7 @@ from pipeline.arrays import Array
 from pipeline.errors import ConfigError
 from pipeline.json_files import Number, computed, read_json, result, written
 from pipeline.plant.chain import Chain
-from pipeline.plant.effect import AugmentedChain, Effect
+from pipeline.plant.effect import AugmentedChain, Effect, effect_name
 from pipeline.results import (
     ChainWithUnits,
     Check,
@@ -24,6 +24,11 @@ from pipeline.submission.toml import first_refusal, quote
 
 Quantity = Literal["position", "velocity", "input"]
 Verdict = Literal["named", "partial", "none", "ambiguous", "unexplained"]
+# Advice: its aim, what distinguishes two explanations, what to record, and what is new about it.
+Aim = Literal["decide", "sharpen", "check", "explain", "extend"]
+DifferIn = Literal["place", "drive", "motion", "quantity"]
+RecordingKind = Literal["decay", "step", "ramp", "sweep", "first_input", "held", "ruler"]
+Change = Literal["smaller", "larger", "both_signs", "finer", "faster"]
 _WHERE = 'place, as {"cart": 1} or {"spring": 2}; empty for an effect on the input'
 
 
@@ -37,21 +42,30 @@ class NamedValue:
 
 
 @result()
-class Alternative:
-    """Another effect that could take the place of the found effect, fitted in the same way."""
+class EffectAt:
+    """An effect and its place."""
 
     effect: Effect = written("name of the effect in the catalogue")
     where: dict[str, int] = written(_WHERE)
+
+    @property
+    def name(self) -> str:
+        """The name inside a sentence, such as "dry (Coulomb) friction on cart 2"."""
+        return effect_name(self.effect, self.where)
+
+
+@result()
+class Alternative(EffectAt):
+    """Another effect that could take the place of the found effect, fitted in the same way."""
+
     nrmse_after: Number = written()
     confidence: Number = written("weight among the models with which it is compared")
 
 
 @result()
-class FoundEffect:
+class FoundEffect(EffectAt):
     """One effect, listed in the order of discovery; its errors are those on held-out runs."""
 
-    effect: Effect = written("name of the effect in the catalogue")
-    where: dict[str, int] = written(_WHERE)
     parameters: dict[str, NamedValue] = written()
     details: dict[str, NamedValue] = written("parameters that only describe a contact")
     confidence: Number = written(
@@ -239,6 +253,39 @@ class Proposal:
     prediction: Prediction | None = None
 
 
+@result()
+class Advice:
+    """What to record next, and why."""
+
+    aim: Aim = written(
+        "decide between two explanations, sharpen a parameter, check the effects found, explain "
+        "the error that remains, or extend the range in which the linear model was tested"
+    )
+    between: tuple[tuple[EffectAt, ...], ...] = written(
+        "two explanations, each with the effects that the other lacks; or one effect", default=()
+    )
+    differ_in: DifferIn | None = written(
+        "what distinguishes the two: the place of the effect, whether it needs the drive, the kind "
+        "of motion that shows it, or the quantity on which it depends",
+        default=None,
+    )
+    parameter: str | None = written("the parameter to sharpen", default=None)
+    kind: RecordingKind | None = written(
+        "null if no kind of recording would help that is not there yet", default=None
+    )
+    change: Change | None = written("how it differs from those of this kind", default=None)
+    cart: int | None = written("the cart to watch", default=None)
+    reach: float | None = written(
+        "largest distance of the cart from its rest: below this, or above it", default=None
+    )
+    there: tuple[str, ...] = written("recordings of this kind that are there", default=())
+    repeat: bool = written("whether to make each recording twice as well", default=False)
+    difference: float | None = written(
+        "largest difference between the two explanations in `next_recording`, position unit",
+        default=None,
+    )
+
+
 @result(eq=False)
 class GapErrors:
     """Relative root-mean-square errors, pooled over the held-out runs."""
@@ -318,7 +365,8 @@ class Gap:
         "the unexplained force on each cart, if the error is too large for a name",
         default=(),
     )
-    next_experiment: str = written()
+    advice: Advice | None = written("what to record next", default=None)
+    next_experiment: str = written("the advice in words", default_factory=str)
 
     @computed(default=None)
     def next_recording(self) -> dict[str, Any] | None:

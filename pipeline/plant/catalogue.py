@@ -37,8 +37,7 @@ COULOMB_FRICTION = Effect(
     parameters=(FORCE,),
     fingerprint="The peaks of a decay fall along a straight line, not an exponential. The cart "
     "stops abruptly, not always at the same position.",
-    deciding_run="Free decays from two release distances: the fitted ζ is smaller for the larger "
-    "swings.",
+    deciding_run="small motions",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="velocity",
     family="dry friction",
@@ -65,8 +64,7 @@ STICTION = Effect(
         EffectParameter("velocity", "w", "position/s", scale="velocity", typical=0.1),
     ),
     fingerprint="The cart sticks at its turning points and breaks loose with a jerk.",
-    deciding_run="A slow ramp of the input: the cart needs more force to break loose than to keep "
-    "moving.",
+    deciding_run="slow motions",
     reference="B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994)",
     axis="velocity",
     family="dry friction",
@@ -87,7 +85,7 @@ PRESLIDING_FRICTION = Effect(
     ),
     fingerprint="The half periods become shorter as the amplitude falls. The cart ends with small, "
     "fast oscillations about its rest position.",
-    deciding_run="Small free decays: the frequency rises as the amplitude falls below δ.",
+    deciding_run="small motions",
     reference="P. R. Dahl, AIAA Journal 14 (1976), 1675-1682",
     axis="velocity",
     family="dry friction",
@@ -103,7 +101,7 @@ LOAD_FRICTION = Effect(
     law=FrictionLaw("μ * abs(u)"),
     parameters=(EffectParameter("coefficient", "μ", "", scale="1", typical=0.03, neutral=0.0),),
     fingerprint="While the motor pushes, there is more dry friction than in a free decay.",
-    deciding_run="Steps of two sizes: doubling the input doubles the added friction.",
+    deciding_run="driven motions",
     reference="B. Armstrong-Hélouvry, Control of Machines with Friction, chapter 2",
     axis="velocity",
 )
@@ -126,8 +124,7 @@ QUADRATIC_DRAG = Effect(
         ),
     ),
     fingerprint="Large swings decay faster than small ones.",
-    deciding_run="Free decays from two release distances: the fitted ζ is larger for the larger "
-    "swings.",
+    deciding_run="large motions",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="velocity",
 )
@@ -151,8 +148,7 @@ FORCE_OFFSET = Effect(
         ),
     ),
     fingerprint="In every run the cart rests off zero, as if pushed by the same force.",
-    deciding_run="Runs with different carts held: the stiffer the springs on the cart, the less a "
-    "force displaces it. A wrong encoder zero shifts the reading equally in all runs.",
+    deciding_run="held carts",
     reference="the balance of forces in the chain at rest",
     axis="position",
     only_rest=True,
@@ -179,7 +175,7 @@ CUBIC_SPRING = Effect(
     ),
     fingerprint="The frequency depends on the amplitude, and the static gain depends on the size "
     "of the step.",
-    deciding_run="A free decay from a large distance: the first period differs from the last.",
+    deciding_run="large motions",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="stretch",
     equivalent="The same effect in the other wall spring, if there is only one cart.",
@@ -207,8 +203,7 @@ SLACK_SPRING = Effect(
         EffectParameter("stretch", "s", "position", scale="position", typical=0.35, side=True),
     ),
     fingerprint="The swings change shape beyond some position, on one side only.",
-    deciding_run="Steps of both signs and several sizes: plotted over the input, the settled "
-    "position is a line with a corner.",
+    deciding_run="both sides",
     reference="S. W. Shaw, P. J. Holmes, Journal of Sound and Vibration 90 (1983), 129-155",
     axis="stretch",
     equivalent="The same effect in the other wall spring at the opposite stretch, if there is "
@@ -228,7 +223,7 @@ COUPLING_DAMPER = Effect(
         ),
     ),
     fingerprint="Modes in which the carts move against each other are damped more than the others.",
-    deciding_run="A free decay of each mode: compare their damping.",
+    deciding_run="held carts",
     reference="L. Meirovitch, Fundamentals of Vibrations, chapter 7",
     axis="velocity",
     between_carts=True,
@@ -254,8 +249,7 @@ DRIVE_DAMPING = Effect(
         ),
     ),
     fingerprint="The cart is damped more after the input steps on than after it steps off.",
-    deciding_run="Steps of two sizes and a free decay: compared with the decay, both steps add the "
-    "same damping.",
+    deciding_run="driven motions",
     reference="back-EMF of a voltage-driven DC motor; any text on electric drives",
     axis="velocity",
 )
@@ -269,8 +263,7 @@ DEAD_ZONE = Effect(
     law=InputLaw("sign(u) * max(abs(u) - w, 0)"),
     parameters=(EffectParameter("width", "w", "input", scale="input", typical=0.08, neutral=0.0),),
     fingerprint="Small inputs move the cart too little: the static gain grows with the step.",
-    deciding_run="Steps of three sizes: plotted over the input, the settled position is a line "
-    "that misses the origin.",
+    deciding_run="small motions",
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 10.5",
     axis="input",
 )
@@ -284,7 +277,7 @@ SATURATION = Effect(
     law=InputLaw("clip(u, -L, L)"),
     parameters=(EffectParameter("limit", "L", "input", scale="input", typical=0.65),),
     fingerprint="Large inputs move the cart too little: the static gain falls as the step grows.",
-    deciding_run="Steps of three sizes: above the limit, a larger input moves the cart no further.",
+    deciding_run="large motions",
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 10.5",
     axis="input",
 )
@@ -303,7 +296,7 @@ INPUT_DELAY = Effect(
     ),
     fingerprint="Every driven motion starts late by the same time. Free decays fit the linear "
     "model.",
-    deciding_run="A step at a high sample rate: the cart starts to move some time after the edge.",
+    deciding_run="edges",
     reference="K. J. Åström, B. Wittenmark, Computer-Controlled Systems, section 2.3",
     axis="time",
     equivalent="A first-order lag whose time constant is much shorter than a sample.",
@@ -323,8 +316,7 @@ ACTUATOR_LAG = Effect(
     ),
     fingerprint="The cart responds to an edge of the input gradually. At high frequencies it "
     "moves less, and later.",
-    deciding_run="A sweep beyond the resonances: a lag lowers the amplitude there, but a delay "
-    "does not.",
+    deciding_run="sweeps",
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 3.2",
     axis="frequency",
     equivalent="A delay, if the time constant is much shorter than a sample.",
@@ -384,8 +376,7 @@ BACKLASH = Effect(
         ),
     ),
     fingerprint="At each reversal of the force there is a short pause, then a knock.",
-    deciding_run="Small steps about zero, and the same steps on top of a constant input. Only the "
-    "steps about zero cross the gap, so only they start late.",
+    deciding_run="about zero",
     reference="M. Nordin, P.-O. Gutman, Automatica 38 (2002), 1633-1649",
     axis="time",
 )
@@ -417,8 +408,7 @@ COGGING = Effect(
     ),
     fingerprint="The cart tends to rest at evenly spaced positions. Plotted over position, the "
     "unexplained force is a sine wave, the same in both directions of travel.",
-    deciding_run="A slow ramp of the input, up and down: the cart jumps between rest positions "
-    "that are the same in both directions. With dry friction they differ.",
+    deciding_run="slow motions",
     reference="D. C. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed., chapter 5",
     axis="position",
 )
@@ -454,7 +444,7 @@ END_STOP = Effect(
     ),
     fingerprint="The largest swings are cut off on one side, always at the same position, with a "
     "bounce.",
-    deciding_run="The same step, a third smaller: the swings are no longer cut off.",
+    deciding_run="large motions",
     reference="K. H. Hunt, F. R. E. Crossley, Journal of Applied Mechanics 42 (1975), 440-445",
     axis="position",
 )
@@ -469,7 +459,7 @@ SENSOR_GAIN = Effect(
     growth=FitCoordinates(("e",), {"g": "1 + e"}, signed=True),
     parameters=(EffectParameter("gain", "g", "", scale="1", typical=0.97, neutral=1.0),),
     fingerprint="No chain of springs can give the measured ratio between the carts' amplitudes.",
-    deciding_run="Move each cart along a ruler and compare the distance with its encoder.",
+    deciding_run="ruler",
     reference="the balance of forces in the chain at rest",
     axis="position",
     fewest_carts=2,
@@ -523,8 +513,7 @@ EXTRA_MODE = Effect(
     ),
     fingerprint="There is one more resonance than there are carts, or a resonance is split into "
     "two peaks.",
-    deciding_run="A sweep through the extra resonance, then the same sweep with the suspected part "
-    "held by hand.",
+    deciding_run="sweeps",
     reference="J. P. Den Hartog, Mechanical Vibrations, section 3.2",
     axis="frequency",
 )

@@ -8,10 +8,11 @@ from matplotlib.figure import Figure
 from pipeline import __version__
 from pipeline.arrays import Array
 from pipeline.estimation.force_balance import without_releases
+from pipeline.gap.advice import differences, disputed, proposed_recording, side_names
 from pipeline.gap.replay import Replay, replay_driven
 from pipeline.gap.residual import ResidualForce, residual_forces
 from pipeline.gap.types import FoundEffect, Gap, GapWindow, RecordGap, Trace
-from pipeline.plant.effect import AugmentedChain, effect_name, place_name
+from pipeline.plant.effect import effect_name, place_name
 from pipeline.report.builder import Page, Part, left_out, remarks
 from pipeline.report.document import (
     Block,
@@ -23,6 +24,7 @@ from pipeline.report.document import (
     cell,
     paragraph,
 )
+from pipeline.report.effect_texts import deciding_experiment
 from pipeline.report.equations.model import augmented_equations, in_order, law
 from pipeline.report.figures.gap import (
     band_shows,
@@ -47,7 +49,6 @@ from pipeline.report.files import Made, make_files
 from pipeline.report.gap_verdict import (
     WORDS,
     added_name,
-    contenders,
     error_board,
     is_set_up_alone,
     kept_together,
@@ -96,7 +97,7 @@ def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = sil
         title = name
         if gap.verdict == "unexplained" or gap.causes:
             title = WORDS.text("suspect", name=name)
-        elif gap.verdict == "ambiguous" and found is contenders(gap)[0]:
+        elif gap.verdict == "ambiguous" and found is disputed(gap)[0]:
             title = WORDS.text("one_explanation", name=name)
         parts.append(
             (
@@ -204,7 +205,7 @@ def _effect(page: Page, gap: Gap, index: int, *, forces: Sequence[ResidualForce]
         blocks.append(rival_table(page, found, gap))
     facts = {
         "fingerprint": effect.fingerprint,
-        "decides": effect.deciding_run,
+        "decides": deciding_experiment(effect),
         "equivalent": effect.equivalent,
         "read": effect.reference,
     }
@@ -331,13 +332,8 @@ def _apart(page: Page, gap: Gap) -> list[Block]:
     predicted = _predicted(page, gap)
     if gap.verdict != "ambiguous":
         return predicted
-    last, rival = contenders(gap)
-    pair = [(last.effect, last.where), *([(rival.effect, rival.where)] if rival else [])]
-    runs = bullet_list(
-        WORDS.spans("apart_run", name=effect_name(effect, where), run=effect.deciding_run)
-        for effect, where in pair
-    )
-    return [paragraph(WORDS.spans("apart")), runs, *predicted]
+    experiment = "" if predicted else clean(gap.next_experiment)
+    return [paragraph(WORDS.spans("apart", experiment=experiment)), *predicted]
 
 
 def _predicted(page: Page, gap: Gap) -> list[Block]:
@@ -346,64 +342,30 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
     if proposal is None or proposal.prediction is None:
         return []
     table = proposal.recording
-    if "release" in table:
-        values = WORDS.text("predicted_release", cart=str(table["release"]))
-    else:
-        values = WORDS.text(
-            "predicted_driven",
-            drive=page.drive,
-            **{key: str(table[key]) for key in ("wave", "amplitude", "frequency")},
-        )
     prediction = proposal.prediction
-    first, second = _distinct_effects(*(gap.contenders[i] for i in prediction.pair))
-    if not first:
-        first, second = second, first
+    sides = differences(*(gap.contenders[i] for i in prediction.pair))
+    if not sides[0]:
+        sides = sides[::-1]
         prediction = replace(prediction, pair=prediction.pair[::-1])
-    one, other = _apart_names(first, second)
+    one, other = side_names(sides)
     names = one, other
     if len(one) + len(other) > LEGEND:
         names = WORDS.text("with_first"), WORDS.text("with_second")
-        if not second:
+        if not sides[1]:
             names = WORDS.text("with_these"), other
     figure = predicted_figure(prediction, names=names, position_unit=page.position)
     paragraph_ = WORDS.spans(
         "predicted",
-        recording=values,
+        recording=proposed_recording(table, drive=page.drive),
         separation=f"{proposal.separation:.2g}",
         one=one,
         other=other,
         hand=WORDS.text("predicted_hand", note=table["note"]) if "note" in table else "",
     )
-    short = "; ".join(_apart_names(first, second, most=_MOST_NAMES))
+    short = "; ".join(side_names(sides, most=_MOST_NAMES))
     values = {"cart": prediction.cart, "names": short}
     picture = page.picture("predicted", figure, WORDS, "predicted_figure", **values)
     return [paragraph(paragraph_), picture]
-
-
-def _distinct_effects(
-    one: AugmentedChain, other: AugmentedChain
-) -> tuple[Sequence[str], Sequence[str]]:
-    """Return, for each of two models, the names of the effects that the other one lacks."""
-    mine, yours = (
-        [effect_name(term.effect, term.where) for term in model.terms] for model in (one, other)
-    )
-    return (
-        [name for name in mine if name not in yours],
-        [name for name in yours if name not in mine],
-    )
-
-
-def _apart_names(
-    first: Sequence[str], second: Sequence[str], *, most: int | None = None
-) -> tuple[str, str]:
-    """Return names for two models, from the lists of effects that only one of them has.
-
-    If the second list is empty, the second model is "without it" or "without them".
-    """
-    one = f"with {listing(first, most=most)}"
-    if second:
-        return one, f"with {listing(second, most=most)}"
-    return one, WORDS.text("without_it" if len(first) == 1 else "without_them")
 
 
 # --------------------------------------------------------------------- the model

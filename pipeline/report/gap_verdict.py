@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.gap.advice import disputed
 from pipeline.gap.limits import AS_REPEATS, AT_FLOOR, NOTHING
-from pipeline.gap.types import Alternative, FoundEffect, Gap, NamedValue, RecordGap
+from pipeline.gap.types import FoundEffect, Gap, NamedValue, RecordGap
 from pipeline.plant.effect import Effect, effect_name, place_name
 from pipeline.report.document import Block, Tile, Tiles, Tone, bullet_list, paragraph, plain_lines
 from pipeline.words.numbers import count, listing, significant, unit_text, with_error
@@ -118,12 +119,10 @@ def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:
 
 def next_block(gap: Gap) -> list[Block]:
     """Return the next recording to make."""
-    if gap.verdict == "none":
-        return [paragraph(WORDS.spans("next_none"))]
-    if not gap.next_experiment:
-        return []
-    key = f"next_{gap.verdict}" if gap.verdict in ("named", "ambiguous") else "next"
-    return [paragraph(WORDS.spans(key, experiment=clean(gap.next_experiment)))]
+    if gap.next_experiment:
+        key = f"next_{gap.advice.aim}" if gap.advice else "next_explain"
+        return [paragraph(WORDS.spans(key, experiment=clean(gap.next_experiment)))]
+    return [paragraph(WORDS.spans("next_none"))] if gap.verdict == "none" else []
 
 
 def terminal_verdict(gap: Gap) -> str:
@@ -150,7 +149,7 @@ def _named(gap: Gap) -> Block:
 
 
 def _ambiguous(gap: Gap) -> list[Block]:
-    last, rival = contenders(gap)
+    last, rival = disputed(gap)
     others = [effect_name(f.effect, f.where) for f in gap.effects if f is not last]
     values = {
         "name": capital(effect_name(last.effect, last.where)),
@@ -236,21 +235,6 @@ def _errors(gap: Gap) -> str:
 
 def _times_left(times: float) -> str:
     return f"The error is still {significant(times, digits=2)} times that"
-
-
-def contenders(gap: Gap) -> tuple[FoundEffect, Alternative | None]:
-    """Return the chosen effect, and the rival (if any) that the data cannot distinguish from it."""
-    close = [
-        (rival.confidence, i, found, rival)
-        for i, found in enumerate(gap.effects)
-        for rival in found.rivals
-        if rival.nrmse_after <= 1.15 * gap.final  # nearly as good as the final model
-        and rival.effect.grows_from != found.effect.key
-    ]
-    if not close:
-        return gap.effects[-1], None
-    _, _, found, rival = max(close, key=lambda entry: entry[:2])
-    return found, rival
 
 
 def kept_together(effects: Sequence[FoundEffect]) -> list[tuple[FoundEffect, ...]]:
