@@ -188,7 +188,8 @@ def test_no_effect_is_added_to_a_sufficient_linear_model_or_a_wrong_set_up():
     assert (advice.aim, advice.kind, advice.change) == ("extend", "decay", "larger")
     every = [(kind, size) for kind in ("decay", "step") for size in (FAR, NEAR)]
     assert advised(gap_of("none", (), every)).advice is None
-    for verdict, keys in (("unexplained", ()), ("named", ("coulomb_friction",)), ("none", ())):
+    cases: Mapping[Verdict, Sequence[str]] = {"unexplained": (), "named": ("stiction",), "none": ()}
+    for verdict, keys in cases.items():
         wrong = advised(replace(gap_of(verdict, keys, [("step", BOTH)]), causes=(CAUSE,)))
         assert (wrong.advice, wrong.next_experiment) == (None, "")
 
