@@ -395,7 +395,7 @@ def _in_words(advice: Advice, gap: Gap) -> str:
             )
         )
     elif advice.kind:
-        key = "_".join(["record", advice.kind, *([advice.change] if advice.change else [])])
+        key = f"record_{advice.kind}" + (f"_{advice.change}" if advice.change else "")
         reach = f"{significant(advice.reach, digits=2)} {units.position}"
         said.append(_WORDS.text(key, cart=advice.cart, reach=reach))
         if advice.change and advice.there:
