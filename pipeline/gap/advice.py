@@ -55,15 +55,15 @@ _OPTIONS: Mapping[DecidingRun, tuple[Option, ...]] = {
 }
 _BOTH_SIZES = (*_OPTIONS["large motions"], *_OPTIONS["small motions"])
 _DRIVEN: frozenset[RecordingKind | None] = frozenset({"step", "ramp", "sweep"})
-# What shows more of a misfit, by what the cart does there.
-_SHOWN_BY: Mapping[str, DecidingRun] = {
-    "velocity near zero": "small motions",
-    "fast motion": "large motions",
-    "large displacement, positive side": "both sides",
-    "large displacement, negative side": "both sides",
-    "after an edge of the input": "edges",
-    "input on": "driven motions",
-    "input off": "driven motions",
+# The recordings that show more of a misfit, by what the cart does there.
+_SHOWING: Mapping[str, tuple[Option, ...]] = {
+    "velocity near zero": _OPTIONS["small motions"],
+    "fast motion": _OPTIONS["large motions"],
+    "large displacement, positive side": _OPTIONS["both sides"],
+    "large displacement, negative side": _OPTIONS["both sides"],
+    "after an edge of the input": (("step", "larger"), ("step", "finer")),
+    "input on": _OPTIONS["driven motions"],
+    "input off": _OPTIONS["driven motions"],
 }
 _AIMS: Mapping[Verdict, Aim] = {
     "none": "extend",
@@ -126,8 +126,8 @@ def proposed_recording(recording: Mapping[str, Any], *, drive: str) -> str:
     return _WORDS.text(
         "predicted_driven",
         wave=recording["wave"],
-        amplitude=significant(recording["amplitude"], digits=3),
-        frequency=significant(recording["frequency"], digits=3),
+        amplitude=f"{recording['amplitude']:g}",
+        frequency=f"{recording['frequency']:g}",
         drive=drive,
     )
 
@@ -160,9 +160,9 @@ def _advise(gap: Gap) -> Advice | None:
             return there.advice(_wanted(_BOTH_SIZES, 1), aim="extend")
         case _:
             window = _window(gap)
-            shown_by = _SHOWN_BY.get(window.what) if window else None
-            options = _OPTIONS[shown_by] if shown_by else _BOTH_SIZES
-            return there.advice(_wanted(options, window.cart if window else 1), aim="explain")
+            what, cart = (window.what, window.cart) if window else ("", 1)
+            wanted = _wanted(_SHOWING.get(what, _BOTH_SIZES), cart)
+            return there.advice(wanted, aim="explain")
 
 
 def _sharpen(gap: Gap, there: "_Recordings") -> Advice | None:
@@ -211,7 +211,7 @@ def _alone(found: EffectAt) -> EffectAt:
 
 def _window(gap: Gap) -> GapWindow | None:
     """Return the worst window in which the cart does something special, or else the worst."""
-    return next((one for one in gap.left if one.what in _SHOWN_BY), next(iter(gap.left), None))
+    return next((one for one in gap.left if one.what in _SHOWING), next(iter(gap.left), None))
 
 
 def _relative_error(found: FoundEffect, name: str) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.gap.advice import disputed
 from pipeline.gap.limits import AS_REPEATS, AT_FLOOR, NOTHING
 from pipeline.gap.types import FoundEffect, Gap, NamedValue, RecordGap
-from pipeline.plant.effect import Effect, effect_name, place_name
+from pipeline.plant.effect import Effect, effect_name
 from pipeline.report.document import Block, Tile, Tiles, Tone, bullet_list, paragraph, plain_lines
 from pipeline.words.numbers import count, listing, significant, unit_text, with_error
 from pipeline.words.phrases import phrases
@@ -82,7 +82,7 @@ def verdict_blocks(gap: Gap) -> list[Block]:
                 paragraph(WORDS.spans("none", noise=_noise(gap), baseline=share(gap.baseline)))
             ]
         case "named" | "partial":
-            blocks = [_named(gap)]
+            blocks = _named(gap)
         case "ambiguous":
             blocks = _ambiguous(gap)
         case "unexplained":
@@ -133,19 +133,24 @@ def terminal_verdict(gap: Gap) -> str:
 # ------------------------------------------------------------------- the verdicts
 
 
-def _named(gap: Gap) -> Block:
-    names = [effect_name(found.effect, found.where) for found in gap.effects]
-    return paragraph(
-        WORDS.spans(
-            "named",
-            names=capital(listing(names)),
-            explain="explains" if len(names) == 1 else "together explain",
-            what="part of what" if gap.verdict == "partial" else "what",
-            sizes="; ".join(_sizes_there(found, several=len(names) > 1) for found in gap.effects),
-            sentences=" ".join(dict.fromkeys(found.effect.sentence for found in gap.effects)),
-            errors=_errors(gap),
+def _named(gap: Gap) -> list[Block]:
+    """Return which effects explain the gap, and each effect with its sizes in its own sentence."""
+    names = [found.name for found in gap.effects]
+    what = "part of what" if gap.verdict == "partial" else "what"
+    said = {"names": capital(listing(names)), "what": what, "errors": _errors(gap)}
+    if len(names) == 1:
+        (found,) = gap.effects
+        sizes, sentence = sizes_text(found.parameters), found.effect.sentence
+        return [paragraph(WORDS.spans("named", sizes=sizes, sentence=sentence, **said))]
+    effects, seen = [], set[str]()
+    for found in gap.effects:
+        sentence = "" if found.effect.key in seen else f" {found.effect.sentence}"
+        seen.add(found.effect.key)
+        sizes = sizes_text(found.parameters)
+        effects.append(
+            WORDS.spans("named_effect", Name=capital(found.name), sizes=sizes, sentence=sentence)
         )
-    )
+    return [paragraph(WORDS.spans("named_together", **said)), bullet_list(effects)]
 
 
 def _ambiguous(gap: Gap) -> list[Block]:
@@ -260,12 +265,6 @@ def sizes_text(parameters: Mapping[str, NamedValue]) -> str:
     return ", ".join(
         f"{name.replace('_', ' ')} {_size(value)}" for name, value in parameters.items()
     )
-
-
-def _sizes_there(found: FoundEffect, *, several: bool) -> str:
-    """Return the sizes of one effect, with its cart or spring if there are several effects."""
-    place = place_name(found.where) if several else ""
-    return sizes_text(found.parameters) + (f" on {place}" if place else "")
 
 
 def _size(value: NamedValue) -> str:
