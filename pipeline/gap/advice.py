@@ -122,7 +122,9 @@ def deciding_run(effect: Effect) -> str:
 def proposed_recording(recording: Mapping[str, Any], *, drive: str) -> str:
     """Return a proposed recording (a table of plan.toml) as a noun phrase."""
     if "release" in recording:
-        return _WORDS.text("predicted_release", cart=recording["release"])
+        return _WORDS.text(
+            "predicted_release", cart=recording["release"], note=recording.get("note", "")
+        )
     return _WORDS.text(
         "predicted_driven",
         wave=recording["wave"],
@@ -251,7 +253,7 @@ class _Recordings:
     """The recordings that are there, by kind and by how far each cart moves."""
 
     def __init__(self, gap: Gap) -> None:
-        self._n, self._repeated = gap.bench.n, gap.repeatability is not None
+        self._n = gap.bench.n
         runs: dict[str, list[Trace]] = defaultdict(list)
         for trace in gap.traces:
             runs[trace.experiment].append(trace)
@@ -264,6 +266,8 @@ class _Recordings:
         }
         self._kinds = {run: _kind(trace, slow=slow) for run, trace in inputs.items()}
         self._signs = {run: {*np.sign(trace.u).tolist()} for run, trace in inputs.items()}
+        # Repeats show how much runs differ only if they have the same input.
+        self._to_repeat = gap.repeatability is None and bool({*self._kinds.values()} & _DRIVEN)
         self._reach: dict[str, dict[int, float]] = {run: {} for run in runs}
         for trace in gap.traces:
             own = self._reach[trace.experiment]
@@ -283,7 +287,7 @@ class _Recordings:
             wanted = [*wanted, *_wanted(_OPTIONS["held carts"], wanted[0][0])]
         missing = (one for one in wanted if not self._has(*one))
         cart, kind, change = next(missing, (None, None, None))
-        repeat = needed and not self._repeated and (aim == "explain" or kind is None)
+        repeat = needed and self._to_repeat and (aim == "explain" or kind is None)
         if kind is None and not repeat and aim not in ("decide", "explain"):
             return None
         if kind in _DRIVEN and not {*self._kinds.values()} & _DRIVEN:

@@ -341,7 +341,6 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
     proposal = gap.proposal
     if proposal is None or proposal.prediction is None:
         return []
-    table = proposal.recording
     prediction = proposal.prediction
     sides = differences(*(gap.contenders[i] for i in prediction.pair))
     if not sides[0]:
@@ -356,11 +355,10 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
     figure = predicted_figure(prediction, names=names, position_unit=page.position)
     paragraph_ = WORDS.spans(
         "predicted",
-        recording=proposed_recording(table, drive=page.drive),
+        recording=proposed_recording(proposal.recording, drive=page.drive),
         separation=f"{proposal.separation:.2g}",
         one=one,
         other=other,
-        hand=WORDS.text("predicted_hand", note=table["note"]) if "note" in table else "",
     )
     short = "; ".join(side_names(sides, most=_MOST_NAMES))
     values = {"cart": prediction.cart, "names": short}

@@ -142,7 +142,8 @@ def test_what_remains_is_shown_where_it_is(verdict, what, runs, wanted):
     for found, repeat in ((runs_repeated, False), (once, True)):
         advice = found.advice
         assert advice is not None
-        assert (advice.aim, advice.repeat) == ("explain", repeat)
+        driven = any(kind != "decay" for kind, _ in runs)  # a hand cannot repeat a decay
+        assert (advice.aim, advice.repeat) == ("explain", repeat and driven)
         assert (advice.kind, advice.change) == wanted
         if wanted[0] and what != "throughout":
             assert advice.cart == 2
@@ -196,7 +197,9 @@ def test_no_effect_is_added_to_a_sufficient_linear_model_or_a_wrong_set_up():
 
 
 @pytest.mark.parametrize("verdict", ["ambiguous", "partial", "named", "unexplained"])
-@pytest.mark.parametrize(("kind", "extra"), [("step", {}), ("decay", {"release": 2})])
+@pytest.mark.parametrize(
+    ("kind", "extra"), [("step", {}), ("decay", {"release": 2, "note": "let go at 0.5"})]
+)
 def test_the_advice_describes_the_proposed_recording(verdict, kind, extra):
     """If a recording is proposed, the advice gives its kind, and by how much the models differ."""
     contenders = tuple(
@@ -217,6 +220,7 @@ def test_the_advice_describes_the_proposed_recording(verdict, kind, extra):
     assert [[e.effect.key for e in side] for side in advice.between] == [["cubic_spring"], []]
     assert ("0.123" in gap.next_experiment) == (not extra)
     assert "0.070" in gap.next_experiment
+    assert ("let go at 0.5" in gap.next_experiment) == bool(extra)
     assert json_text(read_gap(text := json_text(gap))) == text
 
 
