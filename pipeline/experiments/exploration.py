@@ -284,7 +284,6 @@ def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Rec
 # ---------------------------------------------------------------------- the exploration
 
 _FIRST = "sweep"  # the first recording that the plan proposes; nobody has to hold a cart for it
-_SEARCH = 300.0  # s, limit of one search for the gap; most take ten
 # most recordings in a row that distinguish explanations; then another purpose comes first
 _OFTEN = 2
 
@@ -432,7 +431,7 @@ class Exploration:
         gc.collect()  # figures and searches are reference cycles with large arrays
         analysis = analyse(load_submission(self.folder), progress=self.progress)
         try:
-            self.gap = investigate(analysis, progress=self.progress, budget=_SEARCH)
+            self.gap = investigate(analysis, progress=self.progress)
         except DataError as error:
             self.announce(f"the search for the gap is not possible: {error}")
         self._propose(analysis)
@@ -456,8 +455,6 @@ class Exploration:
         missing = self.goal.missing(errors)
         recordings, why = self._choose(missing)
         doubt = describe_doubt(gap) if gap else WORDS.text("no_look")
-        if gap and not gap.complete:
-            doubt += WORDS.text("search_ended", seconds=f"{_SEARCH:.0f}")
         parts = [describe_accuracy(missing, errors), doubt, capital(why) or WORDS.text("the_end")]
         why_ended = ""
         if recordings and not self._has_time_for(recordings[:1]):

@@ -5,7 +5,7 @@ import math
 import re
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,9 @@ _ENCODER_NOISE = 0.2  # counts of noise on a free cart's encoder, which flickers
 class VirtualCarts:
     """Carts that move under a motor and hands, one tick at a time.
 
+    What a run measures depends on the commands so far, but not on the ticks between the runs, which
+    a busy computer may change.
+
     Parameters
     ----------
     seed : seed of the encoders' noise, the hands' tremor and the times of release.
@@ -52,14 +55,11 @@ class VirtualCarts:
         # At power-on, an encoder is at a random position between two counts.
         self._phase = self._noise_rng.uniform(-0.5, 0.5, size=n)
         self.take_in_hand(protocol.Hands())
+        self.renew_noise()
 
     def counts(self) -> tuple[int, ...]:
         """Return the encoder counts since power-on."""
-        noise = next(self._noise, None)
-        if noise is None:
-            block = self._noise_rng.standard_normal((1024, self._shaken.size))
-            self._noise = iter(_ENCODER_NOISE * block * self._shaken)
-            noise = next(self._noise)
+        noise = _ENCODER_NOISE * next(self._noise) * self._shaken
         exact = self._plant.readings / self._bench.count + self._phase + noise
         spare = self.encoders - exact.size
         return (*np.rint(exact).astype(int).tolist(), *(0,) * spare)
@@ -82,17 +82,23 @@ class VirtualCarts:
 
     def take_in_hand(self, hands: protocol.Hands) -> None:
         """Bring all carts to rest; hold some, and pull one out for release in the next run."""
-        self._started = False
+        self._started = self._is_out = False
         n = self._bench.chain.n
         free = [cart for cart in range(1, n + 1) if cart not in hands.held]
         self._shaken = np.isin(np.arange(1, n + 1), free).astype(float)
-        self._noise = iter(np.empty((0, n)))
         self._plant = SteppedBench(self._model, free=free)
         self._hand = self._lead(hands.released) if hands.released in free else None
 
     def start(self) -> None:
-        """Tell the hands that a run starts."""
+        """Tell the hands that a run starts; a cart to be released is then out in any case."""
+        while self._hand is not None and not self._is_out:
+            next(self._hand)
         self._started = True
+        self.renew_noise()
+
+    def renew_noise(self) -> None:
+        """Continue with new noise, however much of the old one was used."""
+        self._noise = _draw_noise(*self._noise_rng.spawn(1), size=self._phase.size)
 
     def _lead(self, cart: int) -> Generator[None]:
         """Pull a cart out, hold it until a run has begun, then let go; one tick per step."""
@@ -111,10 +117,9 @@ class VirtualCarts:
         out, _ = hand.hold(np.zeros(1))
         for angle in np.linspace(0.0, math.pi, math.ceil(1.5 / self._period)):
             yield self._carry(cart, out * (1.0 - math.cos(angle)) / 2.0)
-        held, left = np.zeros(1), hand.release
-        while left > 0.0:
-            held += self._period
-            left -= self._period * self._started
+        self._is_out, held = True, np.zeros(1)
+        while held[0] < hand.release:
+            held += self._period * self._started
             yield self._carry(cart, hand.hold(held)[0])
         force = self._plant.release(cart, velocity=float(hand.hold(held)[1][0]))
         ticks = math.ceil(hand.fade / self._period)
@@ -127,6 +132,12 @@ class VirtualCarts:
 
     def _carry(self, cart: int, to: Array) -> None:
         self._plant.move_by_hand(cart, to=float(to[0]), interval=self._period)
+
+
+def _draw_noise(rng: np.random.Generator, *, size: int) -> Iterator[Array]:
+    """Yield standard normal numbers (size,) without end."""
+    while True:
+        yield from rng.standard_normal((1024, size))
 
 
 def input_per_count(bench: SimulatedBench) -> float:
@@ -388,6 +399,7 @@ class Server:
         self._link = open_link(options.port, remote=options.remote)
         self.events: list[dict] = []
         self._ticks = 0
+        self._run_began = 0, 0  # stamp and tick
         self._still_since = 0.0  # s of the bench's clock
         self._start = protocol.Start(
             wave=protocol.Wave.DELTA, frequency=1.0, amplitude=0
@@ -438,6 +450,12 @@ class Server:
     def _clock(self) -> float:
         return self._ticks * self._period
 
+    @property
+    def _stamp(self) -> int:
+        """The bench's clock in whole ms; in a run, rounding depends only on the ticks of the run."""
+        stamp, tick = self._run_began
+        return stamp + int(1e3 * (self._ticks - tick) * self._period)
+
     def _is_asleep(self) -> bool:
         """Return whether nothing moves and no host is connected."""
         # 10 s of the bench's clock after the motor goes off, everything is at rest.
@@ -460,6 +478,7 @@ class Server:
             case protocol.Start():
                 self._end_run("restarted")
                 self._start, self._ending = command, ""
+                self._run_began = self._stamp, self._ticks
                 self._carts.start()
             case protocol.Hands():
                 self._carts.take_in_hand(command)
@@ -470,11 +489,12 @@ class Server:
                 self._ending = "stopped"
             case protocol.Signal.RESET:
                 self._ending, self._heard = "reset", None
+                self._carts.renew_noise()  # this noise decides where the zero is
 
     def _tick(self) -> bytes:
         """Advance the bench by one tick; return the bytes to send."""
         now = int(1e3 * time.monotonic())
-        duty = self._core.tick(self._carts.counts(), stamp=int(1e3 * self._clock), now=now)
+        duty = self._core.tick(self._carts.counts(), stamp=self._stamp, now=now)
         output = self._core.take().splitlines(keepends=True)
         readings = [line for line in output if not line.startswith(b"?")]
         answers = b"".join(line for line in output if line.startswith(b"?"))

@@ -1,7 +1,10 @@
 """A bench explores itself, with the emulator's carts and over a real line."""
 
 import json
-from collections.abc import Callable, Sequence
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -389,6 +392,37 @@ def test_the_command_explores_a_bench_over_its_line(tmp_path):
     assert (folder / NAME).exists()
     assert [e.kind for e in load_submission(folder).experiments] == ["sweep"]
     assert "run out" in done.stderr
+
+
+@contextmanager
+def busy_computer(processes: int) -> Iterator[None]:
+    """Keep the processors busy while the block runs."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.slow
+def test_a_busy_computer_and_a_slow_bench_give_the_same_answer(tmp_path):
+    """The same bench gives the same data, choices and gap, whatever the clock says meanwhile."""
+    answers = []
+    for processes, speed in ((0, "10"), (2, "6")):
+        folder = tmp_path / str(processes) / "work"
+        folder.parent.mkdir()
+        stop = ("--hide", "end_stop:position=-1.7", "--seed", "2", "--speed", speed)
+        with busy_computer(processes), emulator(*stop, preset="throne-1dof") as bench:
+            limits = ("--until", "all 1%", "--time", "110s")
+            done = cartlab_here("explore", folder, "--port", bench.address, *limits)
+        assert done.returncode == 1, done.stderr
+        files = [folder / "plan.toml", folder / "gap" / "gap.json", *(folder / "data").iterdir()]
+        answers.append({file.name: file.read_text(encoding="utf-8") for file in files})
+    calm, busy = answers
+    assert len(calm) >= 2 + 4  # plan, gap, the first three recordings and a chosen one
+    assert calm == busy
 
 
 @pytest.mark.slow
