@@ -52,7 +52,7 @@ def plan(
     from pipeline.bench.raw import known_commands
     from pipeline.experiments.information import WORST
     from pipeline.experiments.next_recordings import plan_next
-    from pipeline.experiments.plan import plan_data, plan_table
+    from pipeline.experiments.plan import load_plan, plan_data, plan_table
     from pipeline.experiments.propose import current_plan, make_plan
     from pipeline.submission import load_submission
     from pipeline.words.text import with_symbols
@@ -63,30 +63,23 @@ def plan(
     before = {recording.id for recording in current_plan(submission).recordings}
     with progress_line() as progress:
         if number is None:
-            made = make_plan(submission, stock=stock, progress=progress)
-            words, further = [made.trouble, made.message], {}
+            message, trouble = make_plan(submission, stock=stock, progress=progress)
+            words, further = [trouble, message], {}
         else:
             commands = frozenset[str]() if stock else known_commands(folder)
-            made = plan_next(
+            found, wrote = plan_next(
                 submission, n=number, goal=goal or WORST, commands=commands, progress=progress
             )
-            words = [made.wrote, *map(with_symbols, made.sentences)]
-            further = {
-                "next": {"for": made.words, "separation": made.separation}
-                if made.separation is not None
-                else {
-                    "for": made.words,
-                    "now": made.now,
-                    "errors": made.errors,
-                    "planned": made.planned,
-                }
-            }
-    new = {recording.id for recording in made.plan.recordings} - before
+            words = [wrote, *map(with_symbols, found.sentences)]
+            keys = ("now", "errors", "planned") if found.separation is None else ("separation",)
+            further = {"next": {"for": found.words} | {key: getattr(found, key) for key in keys}}
+    made = load_plan(submission)
+    new = {recording.id for recording in made.recordings} - before
     if as_json:
-        data = plan_data(made.plan, submission, new=new) | further
+        data = plan_data(made, submission, new=new) | further
         typer.echo(json.dumps(data, indent=1, ensure_ascii=False))
     else:
-        typer.echo(plan_table(made.plan, submission, new=new))
+        typer.echo(plan_table(made, submission, new=new))
     for sentence in filter(None, words):
         say(sentence)
 

@@ -157,8 +157,8 @@ def propose_recordings(folder: str, stock: bool, *, progress: Progress) -> str:
     """Write plan.toml, or add recordings to it; return the reason if nothing can be planned."""
     from pipeline.experiments.propose import make_plan
 
-    made = make_plan(load_submission(Path(folder)), stock=stock, progress=progress)
-    return made.trouble or "done"
+    _, trouble = make_plan(load_submission(Path(folder)), stock=stock, progress=progress)
+    return trouble or "done"
 
 
 def weigh_recording(
@@ -166,21 +166,27 @@ def weigh_recording(
 ) -> dict[str, Any]:
     """Return how much a typed recording would reduce the error, and how much the best one would."""
     from pipeline.bench.raw import known_commands
-    from pipeline.experiments.next_recordings import compare_recordings as weighed
+    from pipeline.experiments.next_recordings import compare_recordings
     from pipeline.experiments.plan import Recording, what_words
     from pipeline.experiments.propose import current_plan
     from pipeline.workflow import analyse
 
     submission = load_submission(Path(folder))
-    found = weighed(
+    best, after, why = compare_recordings(
         analyse(submission, progress=progress),
-        Recording.model_validate_json(json.dumps(recording)),
+        Recording.model_validate(recording),
         current_plan(submission),
         goal=goal,
         commands=known_commands(submission.folder),
     )
-    chosen = what_words(found.chosen, submission)
-    return {**asdict(found), "chosen": chosen}
+    return {
+        "words": best.words,
+        "now": best.now,
+        "proposed": after,
+        "why": why,
+        "chosen": what_words(best.recordings[0], submission),
+        "best": best.errors[-1],
+    }
 
 
 def describe_exercise(

@@ -13,33 +13,25 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from math import ceil
-from typing import Literal
+from typing import TypeAlias
 
 import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError, PipelineError
-from pipeline.experiments import propose
 from pipeline.experiments.information import sampled_input
+from pipeline.experiments.next_recordings import TRIAL_PERIOD, propose_trials
 from pipeline.experiments.plan import PlanLimits, Recording
+from pipeline.experiments.propose import current_plan
 from pipeline.gap.advice import advised
 from pipeline.gap.limits import CLOSE_BIC, THINNING
 from pipeline.gap.types import Gap, Prediction, Proposal
 from pipeline.plant.augmented import rest_positions, simulate_augmented
-from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain, EffectTerm
-from pipeline.plant.simulate import SETTLED, settling_wait, simulate_linear
 from pipeline.plant.simulator import sensitivity
 from pipeline.plant.simulator.kernel import StartState, describe_run, simulate
 from pipeline.submission import Submission
 
-TrialKind = Literal["step", "sweep"]
-Shape = Literal["square", "triangle", "chirp"]
-
-_PERIOD = 5e-3  # s between samples
-# samples per period, for periods at this multiple of the highest resonance
-_PER_CYCLE, _BEYOND = 10, 2.0
-_TIME = 12.0  # approximate duration of a record in s
 # A record may be this many times longer if it would otherwise not settle its best pair.
 _LONGEST = 4
 _STEP = 1e-3  # relative change of an effect's parameter for a numerical derivative
@@ -47,28 +39,10 @@ _HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # a model with a smaller share of the best
 _DECIDED = CLOSE_BIC * THINNING  # sum of squares that settles a pair
 # Least weight of a model. Correlated residuals make the criterion look too certain.
 _LEAST_WEIGHT = 0.1
+# The value of a recording, the separation of its best pair, and its proposal.
+_Weighed: TypeAlias = tuple[tuple[float, float], float, Proposal]
 # A parameter is not visible if its effect on the motion is below this share of the largest effect.
 _SAME = 1e-9
-
-
-class _Weighed:
-    """A recording, its value, the pair of models that it separates best, and the separation.
-
-    `weight` (models,) is that of each model; the other arguments come from `_separate`.
-    """
-
-    def __init__(
-        self, recording: Recording, *, weight: Array, separation: Array,
-        t: Array, u: Array, predicted: Array,
-    ) -> None:  # fmt: skip
-        self.recording, self.t, self.u, self.predicted = recording, t, u, predicted
-        counted = np.outer(weight, weight)
-        score = counted * separation
-        # First settle as many pairs as possible, then separate them as far as possible.
-        settled = float((counted * np.minimum(separation, _DECIDED)).sum())
-        self.worth = settled, float(score.sum())
-        self.pair = divmod(int(np.argmax(score)), weight.size)
-        self.separation = float(separation[self.pair])
 
 
 def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording] = ()) -> Gap:
@@ -78,7 +52,7 @@ def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording
     because plan.toml is broken, a note says why.
     """
     try:
-        limits = propose.current_plan(submission).limits
+        limits = current_plan(submission).limits
         return advised(with_proposal(gap, limits=limits, without=without))
     except PipelineError as error:
         return replace(gap, notes=(*gap.notes, f"no recording is proposed: {error}"))
@@ -102,44 +76,39 @@ def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] 
     weight[0] = max(weight[0], _LEAST_WEIGHT)  # the chosen model always counts
     if np.count_nonzero(weight) < 2:
         return gap
-    sigma, pinned = _noise(gap), _pinned(gap)
+    sigma, pinned, counted = _noise(gap), _pinned(gap), np.outer(weight, weight)
 
-    def weighed(recording: Recording, height: float) -> _Weighed | None:
+    def weigh(recording: Recording, height: float) -> _Weighed | None:
         found = _separate(models, recording, height, sigma=sigma, pinned=pinned)
         if found is None or np.abs(found[3][weight > 0.0]).max() > limits.travel:
             return None
-        separation, t, u, predicted = found
-        return _Weighed(
-            recording, weight=weight, separation=separation, t=t, u=u, predicted=predicted
+        separation, t, u, x = found
+        score = counted * separation
+        one, other = pair = divmod(int(np.argmax(score)), weight.size)
+        cart = int(np.argmax(np.abs(x[one] - x[other]).max(axis=1)))  # where the pair differs most
+        proposal = Proposal(
+            recording=recording,
+            limits=limits,
+            separation=float(np.sqrt(separation[pair] / (t.size * len(recording.carts)))),
+            prediction=Prediction(pair=pair, cart=cart + 1, t=t, u=u, positions=x[:, cart]),
         )
+        # First settle as many pairs as possible, then separate them as far as possible.
+        settled = float((counted * np.minimum(separation, _DECIDED)).sum())
+        return (settled, float(score.sum())), float(separation[pair]), proposal
 
-    options = [
-        weighed(recording, height)
-        for recording, height in _candidates(models[0].chain, limits)
-        if not any(recording.resembles(other) for other in without)
-    ]
-    best = max((one for one in options if one), key=lambda one: one.worth, default=None)
-    if best is None or best.worth <= (0.0, 0.0):
+    trials = propose_trials(models[0].chain, limits=limits, without=without)
+    weighed = [found for trial in trials if (found := weigh(*trial))]
+    if not weighed:
         return gap
-    if best.separation < _DECIDED and not best.recording.release:
-        times = min(_LONGEST, ceil(_DECIDED / best.separation))
-        longer = {"cycles": times * best.recording.cycles}
-        best = weighed(best.recording.model_copy(update=longer), 0.0) or best
-    return replace(gap, proposal=_propose(best, limits))
-
-
-def _propose(best: _Weighed, limits: PlanLimits) -> Proposal:
-    """Return the proposal for a recording, with the cart on which the pair differs most."""
-    one, other = best.pair
-    cart = int(np.argmax(np.abs(best.predicted[one] - best.predicted[other]).max(axis=1)))
-    return Proposal(
-        recording=best.recording.model_dump(mode="json", exclude_defaults=True),
-        limits=limits.model_dump(),
-        separation=float(np.sqrt(best.separation / (best.t.size * len(best.recording.carts)))),
-        prediction=Prediction(
-            pair=best.pair, cart=cart + 1, t=best.t, u=best.u, positions=best.predicted[:, cart]
-        ),
-    )
+    worth, apart, proposal = max(weighed, key=lambda found: found[0])
+    if worth <= (0.0, 0.0):
+        return gap
+    recording = proposal.recording
+    if apart < _DECIDED and not recording.release:
+        cycles = min(_LONGEST, ceil(_DECIDED / apart)) * recording.cycles
+        if longer := weigh(recording.model_copy(update={"cycles": cycles}), 0.0):
+            proposal = longer[2]
+    return replace(gap, proposal=proposal)
 
 
 def _noise(gap: Gap) -> Array:
@@ -168,75 +137,6 @@ def _pinned(gap: Gap) -> Array:
     )
 
 
-# ----------------------------------------------------------------------- the candidates
-
-
-def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, float]]:
-    """Yield steps in both directions, triangles, chirps and releases, in several sizes.
-
-    With each recording comes the position from which a cart is released, in position units. It is
-    zero if no cart is released.
-    """
-    resonances = np.sort(np.abs(chain.poles)) / (2 * np.pi)
-    settle = propose.rounded(settling_wait(chain, time_constants=SETTLED))
-    everyone = tuple(range(1, chain.n + 1))
-    slow, low, high, fastest = (
-        propose.rounded(float(f))
-        for f in (
-            1.5 / _TIME,
-            0.5 * resonances[0],
-            1.3 * resonances[-1],
-            max(_BEYOND * resonances[-1], 1 / (_PER_CYCLE * _PERIOD)),
-        )
-    )
-    waves: tuple[tuple[Shape, TrialKind, float, float | None], ...] = (
-        ("square", "step", slow, None),
-        ("square", "sweep", propose.rounded(float(resonances[0])), None),
-        ("triangle", "sweep", slow, None),
-        ("triangle", "sweep", propose.rounded(float(resonances[0])), None),
-        ("chirp", "sweep", low, high),
-        # At high frequencies the carts move little, even with the motor's full input. This shows
-        # delays, and laws that matter only for small motions.
-        ("chirp", "sweep", high, fastest),
-        ("chirp", "sweep", propose.rounded(float(np.sqrt(high * fastest))), fastest),
-    )
-    for wave, kind, f, end in waves:
-        whole = Recording(
-            id=f"apart-{wave}",
-            kind=kind,
-            carts=everyone,
-            wave=wave,
-            amplitude=1.0,
-            frequency=f,
-            frequency_end=end,
-            cycles=ceil(_TIME * f),
-            settle=settle,
-            aim="gap",
-        )
-        t, u = sampled_input(whole, period=_PERIOD)
-        reach = float(np.max(np.abs(simulate_linear(chain, t, u))))
-        largest = min(propose.FURTHEST * limits.travel / reach, limits.input)
-        # Several sizes, because laws differ in how they grow with the motion.
-        for size in (1.0, 0.5, 0.2):
-            for sign in (1, -1) if wave == "square" else (1,):
-                amplitude = sign * propose.rounded_down(size * largest)
-                yield whole.model_copy(update={"amplitude": amplitude}), 0.0
-    for cart in everyone:
-        if chain.k[cart - 1] + chain.k[cart] <= 0:
-            continue
-        for share in (0.6, 0.2):  # shares of the travel limit, for a release by hand
-            height = propose.rounded(share * limits.travel)
-            release = propose.release_by_hand(cart, name=f"apart-decay-{cart}", seconds=_TIME)
-            note = f"let go at {share:.0%} of the travel limit, {height:g} from the zero"
-            yield release.model_copy(update={"note": note, "aim": "gap"}), height
-
-
-def far_sweep(chain: Chain, limits: PlanLimits) -> Recording:
-    """Return a sweep through the resonances that moves the carts as far as allowed."""
-    every = (recording for recording, _ in _candidates(chain, limits))
-    return next(one for one in every if one.wave == "chirp").model_copy(update={"id": "sweep"})
-
-
 # ------------------------------------------------------------------ the separation
 
 
@@ -253,7 +153,7 @@ def _separate(
     A separation is the sum of squared differences, relative to the noise, that neither model can
     absorb. The result is None if the motion of a model cannot be computed.
     """
-    t, u = sampled_input(recording, period=_PERIOD)
+    t, u = sampled_input(recording, period=TRIAL_PERIOD)
     u = recording.amplitude * u
     x0 = height * np.eye(sigma.size)[recording.release - 1] if recording.release else None
     try:

@@ -1,7 +1,6 @@
 """Record, identify, look for the gap and choose again, until all is known or time is up."""
 
 import gc
-import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,15 +10,16 @@ import numpy as np
 from pipeline.errors import ConfigError, DataError
 from pipeline.estimation.parametrisation import named_estimates
 from pipeline.experiments import propose
-from pipeline.experiments.discriminate import far_sweep, propose_for
+from pipeline.experiments.discriminate import propose_for
 from pipeline.experiments.information import GAP, ErrorGoal
-from pipeline.experiments.next_recordings import NextPlan, choose_next
+from pipeline.experiments.next_recordings import choose_next, far_sweep
 from pipeline.experiments.plan import (
     Plan,
     PlanLimits,
     Recording,
     load_plan,
     plan_path,
+    recorded_ids,
     save_plan,
     session_time,
     time_words,
@@ -32,7 +32,7 @@ from pipeline.names import parameter_names
 from pipeline.output import own_folder, write_file
 from pipeline.plant.effect import AugmentedChain, effect_name
 from pipeline.results import Analysis, Stage
-from pipeline.submission import System, load_submission
+from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from pipeline.submission.models import MOST_CARTS
 from pipeline.words.numbers import join_names, listing
@@ -47,14 +47,6 @@ WORDS = phrases("exploration")
 
 
 @dataclass(frozen=True, kw_only=True)
-class WeighedExplanation:
-    """One explanation of the gap: its effects in words, and its weight among all explanations."""
-
-    name: str
-    weight: float
-
-
-@dataclass(frozen=True, kw_only=True)
 class Turn:
     """What was known after one turn of an exploration.
 
@@ -63,34 +55,21 @@ class Turn:
     seconds : time at the bench up to the end of this turn, including rests.
     recorded : ids of the recordings made in this turn.
     errors : relative standard error of each parameter, by name; None if unknown.
-    verdict : verdict of the gap analysis; "" if the analysis was not possible.
-    explanations : the competing explanations, the one in the model first. If none compete, only the
-        named explanation; empty if the linear chain is enough.
-    left : the model's error as a share of the motion; None if unknown.
-    floor : the noise floor as a share of the motion; None if unknown.
     reached : whether all requested parameters are known and the gap is named or absent.
     summary : results, doubts and the reason for the next recording, as sentences.
     gap : the gap analysis of this turn; None if it was not possible. For an earlier turn, it keeps
-        only the trace that the diary shows.
+        only the trace that the diary shows; all traces of all turns would need too much memory.
     """
 
     seconds: float
     recorded: tuple[str, ...]
     errors: dict[str, float | None]
-    verdict: str
-    explanations: tuple[WeighedExplanation, ...]
-    left: float | None
-    floor: float | None
     reached: bool
     summary: str
     gap: Gap | None = None
 
     def without_other_traces(self) -> "Turn":
-        """Return the turn without the traces that the diary does not show.
-
-        Each gap analysis has the traces of all runs so far. If they were all kept, memory use would
-        grow with the square of the number of turns.
-        """
+        """Return the turn without the traces that the diary does not show."""
         if self.gap is None:
             return self
         shown = deciding_trace(self.gap, self.recorded)
@@ -148,21 +127,21 @@ def describe_doubt(gap: Gap) -> str:
         case "partial":
             return WORDS.text("part_named", named=named, times=times)
         case "ambiguous":
-            rivals = " or ".join(one.name for one in list_explanations(gap)[:2])
+            rivals = " or ".join(name for name, _ in list_explanations(gap)[:2])
             return WORDS.text("disputed", rivals=rivals)
     if gap.final < NOTHING * gap.noise_floor:
         return WORDS.text("only_fitted")
     return WORDS.text("no_name", times=times)
 
 
-def list_explanations(gap: Gap) -> tuple[WeighedExplanation, ...]:
-    """Return the models that may be true, the chosen one first; it is alone if the gap is named."""
-    contenders = [(one, one.weight) for one in gap.contenders]
+def list_explanations(gap: Gap) -> list[tuple[str, float]]:
+    """Return the names and weights of the models that may be true, the chosen one first.
+
+    A named gap has only the chosen one. If the linear chain is enough, the list is empty.
+    """
     if gap.verdict == "named":
-        contenders = [(gap.model, 1.0)]
-    return tuple(
-        WeighedExplanation(name=name_model(model), weight=weight) for model, weight in contenders
-    )
+        return [(name_model(gap.model), 1.0)]
+    return [(name_model(one), one.weight) for one in gap.contenders]
 
 
 def name_model(model: AugmentedChain) -> str:
@@ -171,7 +150,7 @@ def name_model(model: AugmentedChain) -> str:
     return " and ".join(names) or "the linear chain"
 
 
-# ------------------------------------------------------------------ the next recordings, and why
+# ---------------------------------------------------------------------- the exploration
 
 SETTLED = ("named", "none")
 # Separation squared times seconds: a recording below this limit cannot decide between explanations.
@@ -183,106 +162,6 @@ _HARD = 0.8
 # but each analysis takes as much longer as there are more recordings.
 _SHARE = 0.1
 _FAR_OUT = "far"  # the aim of a recording that shows effects at large motion
-
-
-def choose_recordings(
-    analysis: Analysis,
-    gap: Gap | None,
-    plan: Plan,
-    *,
-    missing: dict[str, float],
-    wanted: float,
-    seconds: float,
-    refused: Sequence[Recording],
-    commands: frozenset[str],
-) -> tuple[tuple[Recording, ...], str]:
-    """Return the next recordings and why they were chosen.
-
-    The result is empty if everything is known or nothing would help. A recording that distinguishes
-    explanations comes first, then some that improve the least known parameter, then one that shows
-    effects at large motion.
-
-    Parameters
-    ----------
-    missing : the parameters that are not known well enough, with their relative errors.
-    wanted : the relative error to reach.
-    seconds : the time left at the bench; of several recordings, those beyond it are dropped.
-    refused : recordings refused before; no similar recording is chosen.
-    commands : the extensions of the protocol that the bench knows.
-    """
-    named = gap is None or gap.verdict in SETTLED
-    # A named model whose error exceeds the noise still counts as only one of several contenders.
-    settled = gap is None or (named and not gap.contenders)
-    end = "" if named else WORDS.text("undecided")
-    decides = gap and gap.proposal
-    predicted = decides and decides.prediction
-    if gap and decides and predicted and decides.separation**2 * predicted.t[-1] > _APART:
-        recording = Recording.model_validate_json(json.dumps(decides.recording))
-        disputed = [name_model(one) for one in gap.contenders]
-        names = " and ".join(f'"{disputed[i]}"' for i in predicted.pair)
-        return (recording,), WORDS.text("differ", names=names, times=f"{decides.separation:.2g}")
-    if missing and named:
-        worst = max(missing, key=lambda name: missing[name])
-        # Recordings of the plan without data give no information yet, so leave them out.
-        made = plan.model_copy(update={"recordings": ()})
-        try:
-            n = max(1, int(_SHARE * len(analysis.records)))
-            found = choose_next(analysis, made, n=n, goal=worst, commands=commands, without=refused)
-        except DataError as error:  # a large step is still possible
-            end = str(error)
-        else:
-            found = _as_needed(found, wanted=wanted, seconds=seconds)
-            return found.recordings, found.summary
-    # Record each of these only once: carts that were held back would go no further the second time.
-    recorded = {record.id for record in analysis.records}
-    tried = [*refused, *(r for r in plan.recordings if r.id in recorded)]
-    for recording, unseen in _reach_far_out(analysis, plan.limits):
-        alike = any(
-            recording.resembles(other) or (other.kind, other.aim) == (recording.kind, _FAR_OUT)
-            for other in tried
-        )
-        if not alike and (unseen or not settled):
-            why = unseen if settled else WORDS.text("as_far")
-            return (recording.model_copy(update={"aim": _FAR_OUT}),), why
-    return (), end
-
-
-def _as_needed(found: NextPlan, *, wanted: float, seconds: float) -> NextPlan:
-    """Return the plan without the recordings beyond the error to reach or the time left.
-
-    The first recording always stays.
-    """
-    for n in range(1, len(found.recordings)):
-        if found.errors[n] <= wanted or session_time(found.recordings[: n + 1]) > seconds:
-            return replace(found, recordings=found.recordings[:n], errors=found.errors[: n + 1])
-    return found
-
-
-def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Recording, str]]:
-    """Yield two recordings that show effects at large motion, each with a reason in words.
-
-    The first is a step to the furthest intended rest position; the second is a sweep with large
-    swings to both sides. The reason is empty if earlier records already go about as far.
-    """
-    chain = propose.identified_chain(analysis)
-    driven = [record for record in analysis.records if record.kind in ("step", "sweep")]
-    inputs = [float(np.abs(record.u).max()) for record in driven if record.u is not None]
-    hardest = max(inputs, default=0.0)
-    furthest = min(
-        max((float((side * y).max()) for record in driven for y in record.y), default=0.0)
-        for side in (1, -1)
-    )
-    step, swing = propose.large_steps(chain, limits)[0], far_sweep(chain, limits)
-    unit = analysis.bench.units.input
-    words = WORDS.text("far_step", most=f"{hardest:.2g}", unit=unit)
-    yield step, words if hardest < _HARD * abs(step.amplitude) else ""
-    unit = analysis.bench.units.position
-    words = WORDS.text("far_swing", most=f"{furthest:.2g}", unit=unit)
-    yield swing, words if furthest < _HARD * propose.FURTHEST * limits.travel else ""
-
-
-# ---------------------------------------------------------------------- the exploration
-
 _FIRST = "sweep"  # the first recording that the plan proposes; nobody has to hold a cart for it
 # most recordings in a row that distinguish explanations; then another purpose comes first
 _OFTEN = 2
@@ -300,8 +179,8 @@ class Recorded:
     why : why requested recordings are missing; empty if none are, or if the reason is unknown.
     """
 
-    ids: tuple[str, ...]
-    seconds: float
+    ids: tuple[str, ...] = ()
+    seconds: float = 0.0
     vetoed: bool = False
     why: str = ""
 
@@ -334,7 +213,6 @@ class Exploration:
     ours : ids in the plan that cartlab added. All other recordings without data were added by a
         person.
     refused : recordings that were vetoed or failed.
-    asked : recordings that were made to decide between explanations.
     lost : the reason why the last chosen recording is missing; empty if it was made.
     failures : number of failures in a row.
     """
@@ -353,7 +231,6 @@ class Exploration:
     spent: float = 0.0
     ours: set[str] = field(default_factory=lambda: {_FIRST})
     refused: list[Recording] = field(default_factory=list)
-    asked: list[Recording] = field(default_factory=list)
     lost: str = ""
     failures: int = 0
 
@@ -369,21 +246,91 @@ class Exploration:
         self._begin()
         self._analyse()
         while recordings := self._take_turn():
-            self._try_out(recordings)
+            self._make(recordings)
+            if self.made:
+                self._analyse()
+            else:
+                self._propose(self.gap)  # find again which recording decides
         return tuple(self.turns)
+
+    def choose(self, missing: dict[str, float]) -> tuple[Sequence[Recording], str]:
+        """Return the next recordings and why they were chosen.
+
+        The result is empty if everything is known or nothing would help. A recording that
+        distinguishes explanations comes first, then some that improve the least known parameter,
+        then one that shows effects at large motion. None resembles a refused one.
+
+        Parameters
+        ----------
+        missing : the parameters that are not known well enough, with their relative errors.
+        """
+        analysis, gap = self.analysis, self.gap
+        limits = load_plan(load_submission(self.folder)).limits
+        named = gap is None or gap.verdict in SETTLED
+        end = "" if named else WORDS.text("undecided")
+        decides = gap and gap.proposal
+        predicted = decides and decides.prediction
+        if gap and decides and predicted and decides.separation**2 * predicted.t[-1] > _APART:
+            names = " and ".join(f'"{name_model(gap.contenders[i])}"' for i in predicted.pair)
+            times = f"{decides.separation:.2g}"
+            return [decides.recording], WORDS.text("differ", names=names, times=times)
+        if missing and named:
+            n = max(1, int(_SHARE * len(analysis.records)))
+            try:
+                found = choose_next(
+                    analysis,
+                    Plan(limits=limits),  # planned recordings give no information yet
+                    n=n,
+                    goal=max(missing, key=lambda name: missing[name]),
+                    commands=self.known_commands(self.folder),
+                    without=self.refused,
+                )
+            except DataError as error:  # a large step is still possible
+                end = str(error)
+            else:
+                # Drop those beyond the error to reach or the time left, but keep the first.
+                while n > 1 and not (
+                    found.errors[n - 1] > self.goal.error
+                    and self._has_time_for(found.recordings[:n])
+                ):
+                    n -= 1
+                found = replace(
+                    found, recordings=found.recordings[:n], errors=found.errors[: n + 1]
+                )
+                return found.recordings, "; ".join(found.sentences)
+        # A named model whose error exceeds the noise is only one of several contenders.
+        settled = named and not (gap and gap.contenders)
+        # Record each of these only once: carts that were held back would go no further.
+        tried = [*self.refused, *self._planned(recorded=True)]
+        for recording, unseen in _reach_far_out(analysis, limits):
+            alike = any(
+                recording.resembles(other) or (other.kind, other.aim) == (recording.kind, _FAR_OUT)
+                for other in tried
+            )
+            if not alike and (unseen or not settled):
+                why = unseen if settled else WORDS.text("as_far")
+                return [recording.model_copy(update={"aim": _FAR_OUT})], why
+        return (), end
 
     def _begin(self) -> None:
         """Make the first recordings of an empty submission, after checking the goal."""
         submission = load_submission(self.folder) if (self.folder / NAME).exists() else None
-        self._check_goal(submission and submission.system)
+        if submission:
+            system = submission.system
+            names = parameter_names(system.carts, rigid=not system.bench.tied)
+        else:  # a goal may name a parameter of any number of carts
+            of_any = (name for n in range(1, MOST_CARTS + 1) for name in parameter_names(n))
+            names = (*parameter_names(1, rigid=True), *of_any)
+        self.goal.missing(dict.fromkeys(names))  # refuses a goal that the carts cannot meet
         known = submission is not None and bool(submission.experiments)
-        planned = submission is not None and plan_path(submission).exists()
-        first = propose.FIRST_SWEEP_TIME
-        if submission and planned:
+        plan = None
+        if submission and plan_path(submission).exists():
             plan = load_plan(submission)
             self.ours.update(one.id for one in plan.recordings)
-            first = session_time([one for one in plan.recordings if one.id == _FIRST])
         if not known:
+            first = propose.FIRST_SWEEP_TIME
+            if plan:
+                first = session_time([one for one in plan.recordings if one.id == _FIRST])
             if first > self.seconds:
                 raise ConfigError(
                     f"--time: the first sweep alone takes {time_words(first)}, "
@@ -391,28 +338,16 @@ class Exploration:
                 )
             self._record([_FIRST])
         submission = load_submission(self.folder)
-        usual = propose.propose_plan(submission)
-        if not plan_path(submission).exists():
-            save_plan(usual, submission)
-        if not planned:
-            self.ours.update(one.id for one in usual.recordings)
+        if plan is None:
+            plan = propose.propose_plan(submission)
+            self.ours.update(one.id for one in plan.recordings)
+            if not plan_path(submission).exists():
+                save_plan(plan, submission)
         if not known:
             recordings = load_plan(submission).recordings
             steps = [one for one in recordings if one.kind == "step" and not one.release]
             if steps and self._has_time_for(steps):
                 self._record([step.id for step in steps])
-
-    def _check_goal(self, system: System | None) -> None:
-        """Refuse a goal that the carts cannot meet.
-
-        If `system` is None, the number of carts is not known yet.
-        """
-        if system:
-            names = parameter_names(system.carts, rigid=not system.bench.tied)
-        else:
-            of_any = (name for n in range(1, MOST_CARTS + 1) for name in parameter_names(n))
-            names = (*parameter_names(1, rigid=True), *of_any)
-        self.goal.missing(dict.fromkeys(names))
 
     def _record(self, ids: Sequence[str]) -> Recorded:
         recorded = self.record(ids)
@@ -431,31 +366,29 @@ class Exploration:
         gc.collect()  # figures and searches are reference cycles with large arrays
         analysis = analyse(load_submission(self.folder), progress=self.progress)
         try:
-            self.gap = investigate(analysis, progress=self.progress)
+            self._propose(investigate(analysis, progress=self.progress))
         except DataError as error:
             self.announce(f"the search for the gap is not possible: {error}")
-        self._propose(analysis)
         self.analysis = _identify_beside(analysis, self.gap)
 
-    def _propose(self, analysis: Analysis) -> None:
+    def _propose(self, gap: Gap | None) -> None:
         """Find the recording that best distinguishes the explanations; save it in gap.json."""
-        if self.gap is None:
+        if gap is None:
             return
-        often = [r for r in self.asked if sum(map(r.resembles, self.asked)) >= _OFTEN]
-        without = [*self.refused, *often]
-        self.gap = propose_for(self.gap, load_submission(self.folder), without=without)
+        submission = load_submission(self.folder)
+        asked = [one for one in self._planned(recorded=True) if one.aim == GAP]
+        often = [one for one in asked if sum(map(one.resembles, asked)) >= _OFTEN]
+        self.gap = propose_for(gap, submission, without=[*self.refused, *often])
         place = own_folder(self.folder, "gap")
         place.mkdir(exist_ok=True)
         write_file(place / "gap.json", json_text(self.gap))
 
-    def _take_turn(self) -> tuple[Recording, ...]:
+    def _take_turn(self) -> Sequence[Recording]:
         """Report what is known; add the next recordings to the plan and return them."""
         self.progress("what to record next")
         gap, errors = self.gap, relative_errors(self.analysis)
         missing = self.goal.missing(errors)
-        recordings, why = self._choose(missing)
-        doubt = describe_doubt(gap) if gap else WORDS.text("no_look")
-        parts = [describe_accuracy(missing, errors), doubt, capital(why) or WORDS.text("the_end")]
+        recordings, why = self._plan_next(missing)
         why_ended = ""
         if recordings and not self._has_time_for(recordings[:1]):
             name = recordings[0].id
@@ -463,101 +396,104 @@ class Exploration:
         # after three failures in a row, another choice does not help
         elif recordings and self.failures >= 3:
             why_ended = WORDS.text("none_came", count=self.failures)
-        if why_ended:
-            recordings = ()
         # whether something useful was left undone
         is_cut_short = bool(why_ended or (self.failures and not recordings))
+        parts = (
+            self.lost,
+            describe_accuracy(missing, errors),
+            describe_doubt(gap) if gap else WORDS.text("no_look"),
+            capital(why) or WORDS.text("the_end"),
+            why_ended,
+        )
         turn = Turn(
             seconds=self.spent,
             recorded=self.made,
             errors=errors,
-            verdict=gap.verdict if gap else "",
-            explanations=list_explanations(gap) if gap else (),
-            left=gap.final if gap else None,
-            floor=gap.noise_floor if gap else None,
             reached=not missing and not is_cut_short and gap is not None and gap.verdict in SETTLED,
-            summary=". ".join(filter(None, [self.lost, *parts, why_ended])).replace("?. ", "? "),
+            summary=". ".join(filter(None, parts)).replace("?. ", "? "),
             gap=gap,
         )
         self.turns.append(turn)
         self.made = ()
         self.write_diary(self.turns, self.analysis, self.folder, wanted=self.goal.error)
         self.announce(turn.summary)
-        return recordings
+        return () if why_ended else recordings
 
-    def _choose(self, missing: dict[str, float]) -> tuple[tuple[Recording, ...], str]:
+    def _plan_next(self, missing: dict[str, float]) -> tuple[list[Recording], str]:
         """Return the next recordings as written in the plan, and their reason."""
-        plan, recordings = load_plan(load_submission(self.folder)), ()
         try:
-            recordings, why = choose_recordings(
-                self.analysis,
-                self.gap,
-                plan,
-                missing=missing,
-                wanted=self.goal.error,
-                seconds=self.seconds - self.spent,
-                refused=self.refused,
-                commands=self.known_commands(self.folder),
-            )
+            recordings, why = self.choose(missing)
         except DataError as error:
-            why = str(error)
+            recordings, why = (), str(error)
         if added := self._added():  # during the computation
-            return (added,), WORDS.text("added", name=added.id)
-        if not recordings:
-            return (), why
-        still, planned = self._unrecorded(), []
+            return [added], WORDS.text("added", name=added.id)
+        still, planned = self._planned(recorded=False), list[Recording]()
         for recording in recordings:
             same = (o for o in still if o.aim == recording.aim and _shape(o) == _shape(recording))
             planned.append(next(same, None) or propose.add_recording(self.folder, recording))
             still = [one for one in still if one.id != planned[-1].id]
-        key = "therefore" if len(planned) == 1 else "therefore_these"
-        names = listing([one.id for one in planned])
-        return tuple(planned), WORDS.text(key, name=names, why=why)
+        if planned:
+            key = "therefore" if len(planned) == 1 else "therefore_these"
+            why = WORDS.text(key, name=listing([one.id for one in planned]), why=why)
+        return planned, why
 
-    def _unrecorded(self) -> list[Recording]:
-        """Return the recordings of the plan that have no data."""
+    def _planned(self, *, recorded: bool) -> list[Recording]:
+        """Return the recordings of the plan that have data, or those without data."""
         submission = load_submission(self.folder)
-        done = {experiment.id for experiment in submission.experiments}
-        return [one for one in load_plan(submission).recordings if one.id not in done]
+        plan = load_plan(submission)
+        done = recorded_ids(plan, submission)
+        return [one for one in plan.recordings if (one.id in done) == recorded]
 
     def _added(self) -> Recording | None:
         """Return the first recording without data that a person added to the plan."""
-        return next((one for one in self._unrecorded() if one.id not in self.ours), None)
+        still = self._planned(recorded=False)
+        return next((one for one in still if one.id not in self.ours), None)
 
-    def _try_out(self, recordings: Sequence[Recording]) -> None:
-        """Make the chosen recordings, and analyse all data again if there are new ones.
+    def _make(self, recordings: Sequence[Recording]) -> None:
+        """Make the chosen recordings; remember why one was not made.
 
-        One that fails, or that a person adds to the plan, ends the series.
+        A recording that fails, or one that a person adds to the plan, ends the series.
         """
         self.turns[-1] = self.turns[-1].without_other_traces()
         self.ours.update(one.id for one in recordings)
         for recording in recordings:
             if self.made and (self._added() or not self._has_time_for([recording])):
-                break
-            if not self._comes(recording):
-                break
-        if self.made:
-            self._analyse()
-        else:
-            self._propose(self.analysis)  # find again which recording decides
+                return
+            vetoed = self.vetoes(recording)
+            came = Recorded(vetoed=True) if vetoed else self._record([recording.id])
+            if came.ids:
+                self.lost, self.failures = "", 0
+                continue
+            self.refused.append(recording)
+            self.failures = 0 if came.vetoed else self.failures + 1
+            if came.why and not came.vetoed:
+                self.lost = WORDS.text("lost_why", name=recording.id, why=came.why)
+            else:
+                self.lost = WORDS.text("vetoed" if came.vetoed else "lost", name=recording.id)
+            return
 
-    def _comes(self, recording: Recording) -> bool:
-        """Make a recording; return whether it was made, or else remember why not."""
-        if self.vetoes(recording):
-            came = Recorded(ids=(), seconds=0.0, vetoed=True)
-        else:
-            came = self._record([recording.id])
-        if came.ids:
-            self.lost, self.failures = "", 0
-            if recording.aim == GAP:
-                self.asked.append(recording)
-            return True
-        self.refused.append(recording)
-        self.failures = 0 if came.vetoed else self.failures + 1
-        key = "vetoed" if came.vetoed else "lost_why" if came.why else "lost"
-        values = {"name": recording.id} | ({"why": came.why} if key == "lost_why" else {})
-        self.lost = WORDS.text(key, **values)
-        return False
+
+def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Recording, str]]:
+    """Yield two recordings that show effects at large motion, each with a reason in words.
+
+    The first is a step to the furthest intended rest position; the second is a sweep with large
+    swings to both sides. The reason is empty if earlier records already go about as far.
+    """
+    chain = propose.identified_chain(analysis)
+    driven = [record for record in analysis.records if record.kind in ("step", "sweep")]
+    inputs = [float(np.abs(record.u).max()) for record in driven if record.u is not None]
+    hardest = max(inputs, default=0.0)
+    furthest = min(
+        max((float((side * y).max()) for record in driven for y in record.y), default=0.0)
+        for side in (1, -1)
+    )
+    step, swing = propose.large_steps(chain, limits)[0], far_sweep(chain, limits)
+    unit = analysis.bench.units.input
+    words = WORDS.text("far_step", most=f"{hardest:.2g}", unit=unit)
+    yield step, words if hardest < _HARD * abs(step.amplitude) else ""
+    unit = analysis.bench.units.position
+    words = WORDS.text("far_swing", most=f"{furthest:.2g}", unit=unit)
+    yield swing, words if furthest < _HARD * propose.FURTHEST * limits.travel else ""
 
 
 def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:

@@ -240,11 +240,14 @@ class FisherInformation:
             for cart in carts
         ]
 
-    def at_its_limits(self, recording: Recording, *, limits: PlanLimits, share: float) -> float:
-        """Return the largest amplitude within the input limit and this `share` of the travel."""
-        t, u = sampled_input(recording, period=self.sample_time)
-        x = simulate_linear(self.chain, t, u, free=recording.carts)
-        return min(share * limits.travel / float(np.max(np.abs(x))), limits.input)
+
+def largest_amplitude(
+    chain: Chain, recording: Recording, *, limits: PlanLimits, share: float, period: float
+) -> float:
+    """Return the largest amplitude within the input limit and this `share` of the travel."""
+    t, u = sampled_input(recording, period=period)
+    x = simulate_linear(chain, t, u, free=recording.carts)
+    return min(share * limits.travel / float(np.max(np.abs(x))), limits.input)
 
 
 def sampled_input(recording: Recording, *, period: float) -> tuple[Array, Array]:

@@ -1,14 +1,16 @@
-"""Implement `cartlab plan --next`: choose the most useful experiments and predict the benefit."""
+"""Which recordings next: the candidates within the limits, and the choice for a goal.
 
-import json
-from collections.abc import Collection, Iterator, Sequence
+For a parameter, the candidates are weighed here by their information; for a gap, `discriminate`
+weighs them by how well they tell its explanations apart.
+"""
+
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import ceil, isclose
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import ConfigError, DataError
@@ -20,6 +22,7 @@ from pipeline.experiments.information import (
     check_goal,
     choose,
     find_goal,
+    largest_amplitude,
 )
 from pipeline.experiments.plan import (
     Plan,
@@ -30,10 +33,17 @@ from pipeline.experiments.plan import (
     session_time,
     time_words,
 )
-from pipeline.experiments.propose import FURTHEST, current_plan, rounded, rounded_down
-from pipeline.gap.types import read_gap
+from pipeline.experiments.propose import (
+    FURTHEST,
+    current_plan,
+    release_by_hand,
+    rounded,
+    rounded_down,
+)
+from pipeline.gap.types import Proposal, read_gap
 from pipeline.ingest.read import read_data
 from pipeline.names import parameter_names
+from pipeline.plant.chain import Chain
 from pipeline.plant.limits import CALIBRATION
 from pipeline.plant.simulate import SETTLED, SETTLED_DWELL, dwell_frequencies, settling_wait
 from pipeline.results import Analysis
@@ -127,6 +137,11 @@ _PERIODS = 2  # periods of a multisine in a record
 _BAND = (0.4, 1.6)  # lowest and highest frequency, as multiples of the first and the last resonance
 _DWELLS = 40  # number of frequencies for dwells
 
+TRIAL_PERIOD = 5e-3  # s between samples of a trial
+# samples per period, for periods at this multiple of the highest resonance
+_PER_CYCLE, _BEYOND = 10, 2.0
+_TRIAL_TIME = 12.0  # approximate duration of a trial in s
+
 
 def propose_candidates(
     known: FisherInformation, *, limits: PlanLimits, commands: Collection[str], goal: Goal
@@ -140,15 +155,17 @@ def propose_candidates(
     ------
     DataError : the limits allow no candidate, or dwells would take too long to settle.
     """
-    made = list(_dwells(known) if known.dwells else _broadband(known, limits, commands, goal))
-    settle = rounded(settling_wait(known.chain, time_constants=SETTLED))
-    carts = tuple(range(1, known.chain.n + 1))
+    free = _free(known.chain)
+    made = list(
+        _dwells(known, free) if known.dwells else _broadband(known, free, limits, commands, goal)
+    )
     candidates = []
     for recording in made:
-        whole = recording.model_copy(update={"carts": carts, "settle": settle})
-        size = known.at_its_limits(whole, limits=limits, share=FURTHEST)
+        size = largest_amplitude(
+            known.chain, recording, limits=limits, share=FURTHEST, period=known.sample_time
+        )
         if size > 0:
-            candidates.append(whole.model_copy(update={"amplitude": rounded_down(size)}))
+            candidates.append(recording.model_copy(update={"amplitude": rounded_down(size)}))
     if not candidates:
         raise DataError(
             "no next experiment: the limits of plan.toml allow none"
@@ -158,7 +175,23 @@ def propose_candidates(
     return candidates
 
 
-def _dwells(known: FisherInformation) -> Iterator[Recording]:
+def _free(chain: Chain) -> Callable[..., Recording]:
+    """Return a function that makes recordings at unit amplitude with all carts free, from rest."""
+    return partial(
+        Recording,
+        kind="sweep",
+        carts=tuple(range(1, chain.n + 1)),
+        amplitude=1.0,
+        settle=rounded(settling_wait(chain, time_constants=SETTLED)),
+    )
+
+
+def _resonances(chain: Chain) -> Array:
+    """Return the resonances in Hz, the lowest first."""
+    return np.sort(np.abs(chain.poles)) / (2 * np.pi)
+
+
+def _dwells(known: FisherInformation, free: Callable[..., Recording]) -> Iterator[Recording]:
     """Yield dwells; each lasts twice as long as the carts need to reach the steady state.
 
     If the steady state takes too long to reach, no dwell is yielded. A transient would be mistaken
@@ -169,44 +202,96 @@ def _dwells(known: FisherInformation) -> Iterator[Recording]:
         return
     for hertz in dwell_frequencies(known.chain, n=_DWELLS):
         cycles = ceil(2 * wait * hertz)
-        yield _free("sine-01", "sine", frequency=hertz, cycles=cycles)
+        yield free(id="sine-01", kind="sine", wave="sine", frequency=hertz, cycles=cycles)
 
 
 def _broadband(
-    known: FisherInformation, limits: PlanLimits, commands: Collection[str], goal: Goal
+    known: FisherInformation,
+    free: Callable[..., Recording],
+    limits: PlanLimits,
+    commands: Collection[str],
+    goal: Goal,
 ) -> Iterator[Recording]:
-    resonances = np.sort(np.abs(known.chain.poles)) / (2 * np.pi)
-    seconds = float(rounded(max(20.0, 20 / resonances[0])))  # 20 s, or 20 of the slowest periods
-    for hertz in np.geomspace(0.1 * resonances[0], resonances[-1], 8):
+    low, high = _resonances(known.chain)[[0, -1]]
+    seconds = rounded(max(20.0, 20 / low))  # 20 s, or 20 of the slowest periods
+    for hertz in np.geomspace(0.1 * low, high, 8):
         f = rounded(float(hertz))
-        yield _free("square-1", "square", frequency=f, cycles=ceil(seconds * f))
+        yield free(id="square-1", wave="square", frequency=f, cycles=ceil(seconds * f))
     if "c" in commands:
-        edges = [
-            rounded(float(f))
-            for f in np.geomspace(_BAND[0] * resonances[0], _BAND[1] * resonances[-1], 6)
-        ]
-        for low, high in ((a, b) for a in edges for b in edges if a < b):
-            cycles = ceil(seconds * low)
-            yield _free("sweep-1", "chirp", frequency=low, end=high, cycles=cycles)
+        edges = [rounded(float(f)) for f in np.geomspace(_BAND[0] * low, _BAND[1] * high, 6)]
+        for f, end in ((a, b) for a in edges for b in edges if a < b):
+            cycles = ceil(seconds * f)
+            yield free(id="sweep-1", wave="chirp", frequency=f, frequency_end=end, cycles=cycles)
     if "m" in commands:
         base = rounded(_PERIODS / seconds)
         travel = FURTHEST * limits.travel
         tones = optimal_tones(known, base=base, seconds=seconds, travel=travel, goal=goal)
-        yield _free("multisine-1", "multisine", frequency=base, cycles=_PERIODS, tones=tones)
+        yield free(id="multisine-1", wave="multisine", frequency=base, cycles=_PERIODS, tones=tones)
 
 
-def _free(name, wave, *, frequency, cycles, end=None, tones=()) -> Recording:
-    return Recording(
-        id=name,
-        kind="sine" if wave == "sine" else "sweep",
-        carts=(1,),
-        wave=wave,
-        amplitude=1.0,
-        frequency=frequency,
-        frequency_end=end,
-        cycles=cycles,
-        tones=tones,
+def propose_trials(
+    chain: Chain, *, limits: PlanLimits, without: Sequence[Recording] = ()
+) -> Iterator[tuple[Recording, float]]:
+    """Yield steps in both directions, triangles, chirps and releases, in several sizes.
+
+    With each recording comes the position from which a cart is released, in position units. It is
+    zero if no cart is released. No recording resembles one of those in `without`.
+    """
+    free, resonances = _free(chain), _resonances(chain)
+    slow, low, resonance, high, fastest = (
+        rounded(float(f))
+        for f in (
+            1.5 / _TRIAL_TIME,
+            0.5 * resonances[0],
+            resonances[0],
+            1.3 * resonances[-1],
+            max(_BEYOND * resonances[-1], 1 / (_PER_CYCLE * TRIAL_PERIOD)),
+        )
     )
+    trials: list[tuple[Recording, float]] = []
+    for wave, kind, f, end in (
+        ("square", "step", slow, None),
+        ("square", "sweep", resonance, None),
+        ("triangle", "sweep", slow, None),
+        ("triangle", "sweep", resonance, None),
+        ("chirp", "sweep", low, high),
+        # At high frequencies the carts move little, even with the motor's full input. This shows
+        # delays, and laws that matter only for small motions.
+        ("chirp", "sweep", high, fastest),
+        ("chirp", "sweep", rounded(float(np.sqrt(high * fastest))), fastest),
+    ):
+        whole = free(
+            id=f"apart-{wave}",
+            kind=kind,
+            wave=wave,
+            frequency=f,
+            frequency_end=end,
+            cycles=ceil(_TRIAL_TIME * f),
+            aim=GAP,
+        )
+        largest = largest_amplitude(
+            chain, whole, limits=limits, share=FURTHEST, period=TRIAL_PERIOD
+        )
+        # Several sizes, because laws differ in how they grow with the motion.
+        for size in (1.0, 0.5, 0.2):
+            for sign in (1, -1) if wave == "square" else (1,):
+                amplitude = sign * rounded_down(size * largest)
+                trials.append((whole.model_copy(update={"amplitude": amplitude}), 0.0))
+    for cart in whole.carts:
+        if chain.k[cart - 1] + chain.k[cart] <= 0:
+            continue
+        for share in (0.6, 0.2):  # shares of the travel limit, for a release by hand
+            height = rounded(share * limits.travel)
+            release = release_by_hand(cart, name=f"apart-decay-{cart}", seconds=_TRIAL_TIME)
+            note = f"let go at {share:.0%} of the travel limit, {height:g} from the zero"
+            trials.append((release.model_copy(update={"note": note, "aim": GAP}), height))
+    return (one for one in trials if not any(one[0].resembles(other) for other in without))
+
+
+def far_sweep(chain: Chain, limits: PlanLimits) -> Recording:
+    """Return a sweep through the resonances that moves the carts as far as allowed."""
+    every = (recording for recording, _ in propose_trials(chain, limits=limits))
+    return next(one for one in every if one.wave == "chirp").model_copy(update={"id": "sweep"})
 
 
 # ---------------------------------------------------------------------- the choice
@@ -219,40 +304,32 @@ STATISTICAL = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class NextPlan:
-    """The chosen experiments, and the expected error after each of them.
+class Choice:
+    """The chosen recordings, and the expected error after each of them.
 
     Attributes
     ----------
+    words : the error that they reduce, such as "the error of zeta_2"; "gap" for a gap.
     now : present relative error.
     errors : (n + 1,) relative error after the open recordings of the plan, then after each chosen
-        experiment.
+        recording.
     planned : relative error after each open recording of the plan alone, by the recording's id.
     separation : only for "gap": distance between the two explanations that the recording separates
         best, in standard deviations of the noise.
-    wrote : the change of plan.toml, in words.
     doubt : why the errors are not reliable, whatever is recorded; empty if they are reliable.
     """
 
     words: str
-    plan: Plan
-    path: Path | None
     recordings: tuple[Recording, ...]
     now: float = float("nan")
     errors: tuple[float, ...] = ()
     planned: dict[str, float] = field(default_factory=dict)
     separation: float | None = None
-    wrote: str = ""
     doubt: str = ""
 
     @property
-    def summary(self) -> str:
-        """The benefit of the experiments in one sentence."""
-        return "; ".join(self.sentences)
-
-    @property
     def sentences(self) -> tuple[str, ...]:
-        """The benefit of the experiments, with notes."""
+        """The benefit of the recordings, with notes."""
         if self.separation is not None:
             return (
                 f"{self.recordings[0].id} tells two explanations of the gap apart by "
@@ -278,68 +355,6 @@ class NextPlan:
         return tuple(sentence for sentence in notes if sentence)
 
 
-def plan_next(
-    submission: Submission,
-    *,
-    n: int,
-    goal: str = WORST,
-    commands: frozenset[str],
-    progress: Progress,
-) -> NextPlan:
-    """Choose the `n` next experiments of a submission and add them to its plan.toml.
-
-    Parameters
-    ----------
-    commands : the extensions of the protocol that the bench knows.
-
-    Raises
-    ------
-    DataError : the recorded data do not identify the carts, so nothing can be predicted.
-    ConfigError : there is no such goal, or gap.json is broken or was made from other data or
-        limits.
-    """
-    path = plan_path(submission)
-    old, new = current_plan(submission), not path.exists()
-    if goal == GAP:
-        if n != 1:
-            raise ConfigError(f"--for gap chooses one recording: expected --next 1, found {n}")
-        recording, separation = _decisive(submission, old.limits)
-        found = NextPlan(
-            words="gap", plan=old, path=path, recordings=(recording,), separation=separation
-        )
-        done = {experiment.id for experiment in submission.experiments}
-        open_ = [one for one in old.recordings if one.id not in done]
-        if not new and (there := next((o for o in open_ if o.resembles(recording)), None)):
-            return replace(found, recordings=(there,), wrote=f"{path}: has {there.id} already")
-    else:
-        system = submission.system
-        check_goal(goal, names=parameter_names(system.carts, rigid=not system.bench.tied))
-        progress("evaluating the data")
-        analysis = analyse(submission)
-        progress("weighing the next experiments")
-        found = choose_next(analysis, old, n=n, goal=goal, commands=commands)
-        found = replace(found, path=path, doubt=_doubt(analysis, submission.folder))
-    plan = add_recordings(submission.folder, found.recordings, otherwise=old)
-    wrote = f"{path}: {count(n, 'recording')} added"
-    if new and old.recordings:
-        usual = count(len(old.recordings), "recording")
-        chosen = count(n, "chosen recording")
-        wrote = f"wrote {path}: the {usual} that every plan begins with, and {chosen}"
-    return replace(found, plan=plan, recordings=plan.recordings[-n:], wrote=wrote)
-
-
-def _doubt(analysis: Analysis, folder: Path) -> str:
-    """Return a warning if the residual exceeds the noise, which predicted errors do not count."""
-    fit = analysis.fit
-    if fit is None or fit.explains_data:
-        return ""
-    return (
-        f"the linear carts leave a residual above the noise (χ² per degree of freedom "
-        f"{fit.chi_square_per_dof:.3g}), so parameters may be off by more than these errors; "
-        f"`cartlab gap {folder}` looks for the missing effect"
-    )
-
-
 def choose_next(
     analysis: Analysis,
     plan: Plan,
@@ -348,16 +363,18 @@ def choose_next(
     goal: str,
     commands: frozenset[str],
     without: Sequence[Recording] = (),
-) -> NextPlan:
-    """Choose the `n` next experiments, and predict the error after each.
+) -> Choice:
+    """Choose the `n` next recordings, and predict the error after each.
 
     Parameters
     ----------
-    without : recordings that the chosen experiments must not resemble.
+    commands : the extensions of the protocol that the bench knows.
+    without : recordings that the chosen ones must not resemble.
 
     Raises
     ------
-    DataError, ConfigError : see `plan_next`.
+    DataError : the recorded data do not identify the carts, or no candidate helps.
+    ConfigError : there is no such goal.
     """
     known = FisherInformation.of(analysis)
     wanted = find_goal(goal, known, feedback=analysis.feedback)
@@ -388,10 +405,8 @@ def choose_next(
         )
         for one, before, after in zip(chosen, errors, errors[1:], strict=False)
     )
-    return NextPlan(
+    return Choice(
         words=words,
-        plan=plan,
-        path=None,
         recordings=recordings,
         now=float(wanted.of(known.information)),
         errors=tuple(errors.tolist()),
@@ -408,52 +423,15 @@ def why_useless(recording: Recording, known: FisherInformation, *, limits: PlanL
         return f"the carts are identified from {used} here, but this is a {what}"
     if len(recording.carts) < known.chain.n:
         return "the carts are identified from records with all of them free"
-    most = known.at_its_limits(recording, limits=limits, share=1.0)
+    most = largest_amplitude(
+        known.chain, recording, limits=limits, share=1.0, period=known.sample_time
+    )
     if abs(recording.amplitude) > most:
         return (
             f"it would be stopped at the travel limit; with an amplitude up to {most:.2g} it would "
             "not be stopped"
         )
     return ""
-
-
-def _decisive(submission: Submission, limits: PlanLimits) -> tuple[Recording, float]:
-    """Return the recording that `cartlab gap` proposes, and its predicted separation.
-
-    Raises
-    ------
-    DataError : there is no gap.json, or it contains no proposal.
-    ConfigError : gap.json is broken, or was made from other data or limits.
-    """
-    path = submission.folder / "gap" / "gap.json"
-    command = f"`cartlab gap {submission.folder}`"
-    if not path.is_file():
-        raise DataError(f"--for gap: there is no {path}: run {command} first")
-    text = read_text(path, where="gap/gap.json", limit=10_000_000, error=ConfigError)
-    try:
-        found = read_gap(text)
-        if found.proposal is None:
-            raise DataError(
-                "--for gap: gap/gap.json proposes no recording, because there is nothing to decide "
-                f'(its verdict is "{found.verdict}")'
-            )
-        recording = Recording.model_validate_json(json.dumps(found.proposal.recording))
-    except (ConfigError, ValidationError):
-        raise ConfigError(
-            f"--for gap: gap/gap.json is not what cartlab gap writes: run {command} again"
-        ) from None
-    system = submission.system
-    of = (found.bench.n, found.bench.units.position, found.bench.units.input)
-    here = (system.carts, system.position.unit, system.input.unit)
-    if of != here or found.provenance.files != read_data(submission).files:
-        raise ConfigError(f"--for gap: gap/gap.json was made from other data: run {command} again")
-    kept = found.proposal.limits
-    # gap.json has only ten digits.
-    if not all(isclose(kept.get(name, 0.0), limit, rel_tol=1e-9) for name, limit in limits):
-        raise ConfigError(
-            f"--for gap: the limits in plan.toml are not those of gap/gap.json: run {command} again"
-        )
-    return recording, found.proposal.separation
 
 
 def _words(goal: Goal, known: FisherInformation, *, after: Array) -> str:
@@ -483,46 +461,118 @@ _WHY_WORSE = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ComparedRecordings:
-    """Relative errors: now, after only the proposed recording, and after only the best recording.
-
-    Attributes
-    ----------
-    words : the error to reduce, such as "the error of zeta_2".
-    why : why the proposed recording does not help, or even does harm; empty if it helps.
-    """
-
-    words: str
-    now: float
-    proposed: float
-    why: str
-    chosen: Recording
-    best: float
-
-
 def compare_recordings(
     analysis: Analysis, proposed: Recording, plan: Plan, *, goal: str, commands: frozenset[str]
-) -> ComparedRecordings:
+) -> tuple[Choice, float, str]:
     """Compare a recording with the best recording for a goal that the plan's limits allow.
+
+    Returns the best one, the error after only the proposed one, and why that does not help, or even
+    does harm; "" if it helps.
 
     Raises
     ------
     DataError, ConfigError : see `choose_next`.
     """
     nothing_open = plan.model_copy(update={"recordings": ()})
-    found = choose_next(analysis, nothing_open, n=1, goal=goal, commands=commands)
+    best = choose_next(analysis, nothing_open, n=1, goal=goal, commands=commands)
     known = FisherInformation.of(analysis)
     error = find_goal(goal, known, feedback=analysis.feedback).of
-    why = why_useless(proposed, known, limits=plan.limits)
-    after = found.now if why else float(error(known.information + known.of_recording(proposed)))
-    if after > 1.01 * found.now:  # 1 % is visible in two digits
-        why = _WHY_WORSE
-    return ComparedRecordings(
-        words=found.words,
-        now=found.now,
-        proposed=after,
-        why=why,
-        chosen=found.recordings[0],
-        best=found.errors[-1],
-    )
+    if why := why_useless(proposed, known, limits=plan.limits):
+        return best, best.now, why
+    after = float(error(known.information + known.of_recording(proposed)))
+    return best, after, _WHY_WORSE if after > 1.01 * best.now else ""  # 1 % shows in two digits
+
+
+# ---------------------------------------------------------------------- `cartlab plan --next`
+
+
+def plan_next(
+    submission: Submission,
+    *,
+    n: int,
+    goal: str = WORST,
+    commands: frozenset[str],
+    progress: Progress,
+) -> tuple[Choice, str]:
+    """Choose the `n` next recordings of a submission and add them to its plan.toml.
+
+    Returns the recordings as the plan has them, and the change of plan.toml in words.
+
+    Raises
+    ------
+    DataError : see `choose_next`; or there is no gap to decide.
+    ConfigError : there is no such goal, or gap.json is broken or was made from other data or
+        limits.
+    """
+    path, old = plan_path(submission), current_plan(submission)
+    new = not path.exists()
+    if goal == GAP:
+        if n != 1:
+            raise ConfigError(f"--for gap chooses one recording: expected --next 1, found {n}")
+        decides = _read_proposal(submission, old.limits)
+        recording = decides.recording
+        found = Choice(words=GAP, recordings=(recording,), separation=decides.separation)
+        done = {experiment.id for experiment in submission.experiments}
+        open_ = [one for one in old.recordings if one.id not in done and one.resembles(recording)]
+        if open_ and not new:
+            return replace(found, recordings=(open_[0],)), f"{path}: has {open_[0].id} already"
+    else:
+        system = submission.system
+        check_goal(goal, names=parameter_names(system.carts, rigid=not system.bench.tied))
+        progress("evaluating the data")
+        analysis = analyse(submission)
+        progress("weighing the next experiments")
+        found = choose_next(analysis, old, n=n, goal=goal, commands=commands)
+        if (fit := analysis.fit) and not fit.explains_data:  # no predicted error counts this
+            doubt = (
+                f"the linear carts leave a residual above the noise (χ² per degree of freedom "
+                f"{fit.chi_square_per_dof:.3g}), so parameters may be off by more than these "
+                f"errors; `cartlab gap {submission.folder}` looks for the missing effect"
+            )
+            found = replace(found, doubt=doubt)
+    plan = add_recordings(submission.folder, found.recordings, otherwise=old)
+    wrote = f"{path}: {count(n, 'recording')} added"
+    if new and old.recordings:
+        usual = count(len(old.recordings), "recording")
+        chosen = count(n, "chosen recording")
+        wrote = f"wrote {path}: the {usual} that every plan begins with, and {chosen}"
+    return replace(found, recordings=plan.recordings[-n:]), wrote
+
+
+def _read_proposal(submission: Submission, limits: PlanLimits) -> Proposal:
+    """Return the recording that `cartlab gap` proposes for these data and limits.
+
+    Raises
+    ------
+    DataError : there is no gap.json, or it contains no proposal.
+    ConfigError : gap.json is broken, or was made from other data or limits.
+    """
+    path = submission.folder / "gap" / "gap.json"
+    command = f"`cartlab gap {submission.folder}`"
+    if not path.is_file():
+        raise DataError(f"--for gap: there is no {path}: run {command} first")
+    text = read_text(path, where="gap/gap.json", limit=10_000_000, error=ConfigError)
+    try:
+        gap = read_gap(text)
+    except ConfigError:
+        raise ConfigError(
+            f"--for gap: gap/gap.json is not what cartlab gap writes: run {command} again"
+        ) from None
+    if gap.proposal is None:
+        raise DataError(
+            "--for gap: gap/gap.json proposes no recording, because there is nothing to decide "
+            f'(its verdict is "{gap.verdict}")'
+        )
+    system, kept = submission.system, gap.proposal.limits
+    of = (gap.bench.n, gap.bench.units.position, gap.bench.units.input)
+    here = (system.carts, system.position.unit, system.input.unit)
+    if of != here or gap.provenance.files != read_data(submission).files:
+        raise ConfigError(f"--for gap: gap/gap.json was made from other data: run {command} again")
+    # gap.json has only ten digits.
+    if not kept or not all(
+        isclose(getattr(kept, name), limit, rel_tol=1e-9) for name, limit in limits
+    ):
+        raise ConfigError(
+            f"--for gap: the limits in plan.toml are not those of gap/gap.json: run {command} again"
+        )
+    return gap.proposal

@@ -6,7 +6,6 @@ dwells, the designed controller is run.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from math import ceil, floor, log10
 from pathlib import Path
 from typing import Literal, get_args
@@ -58,30 +57,19 @@ _DWELLS = 24
 _STEP = 0.9  # final level of a step, as a share of the aim; the step overshoots up to twice as far
 
 
-@dataclass(frozen=True, kw_only=True)
-class MadePlan:
-    """A plan, with a message about what was written.
-
-    Attributes
-    ----------
-    message : the message, in one sentence.
-    trouble : why the data could not be used; empty if they were used, or if there are no data.
-    """
-
-    plan: Plan
-    path: Path
-    message: str
-    trouble: str
-
-
 def current_plan(submission: Submission, *, bench: Description | None = None) -> Plan:
     """Return the plan of a submission, or a proposal if the file is missing."""
     there = plan_path(submission).exists()
     return load_plan(submission) if there else propose_plan(submission, bench=bench)
 
 
-def make_plan(submission: Submission, *, stock: bool = False, progress: Progress) -> MadePlan:
+def make_plan(
+    submission: Submission, *, stock: bool = False, progress: Progress
+) -> tuple[str, str]:
     """Write plan.toml, or add the recordings that the data make possible.
+
+    Returns what was written, in one sentence, and why the data could not be used; "" if they were
+    used, or if there are no data.
 
     Parameters
     ----------
@@ -96,10 +84,11 @@ def make_plan(submission: Submission, *, stock: bool = False, progress: Progress
     except DataError as error:  # if the data cannot be used, the plan stays as it is
         new, trouble = old, str(error)
     added = new.recordings[len(old.recordings) :]
-    new, path = add_recordings(submission.folder, added, otherwise=old), plan_path(submission)
-    added_words = f"{path}: {count(len(added), 'recording')} added"
-    message = added_words if there else f"wrote {path}: check its [limits]"
-    return MadePlan(plan=new, path=path, message=message, trouble=trouble)
+    add_recordings(submission.folder, added, otherwise=old)
+    path = plan_path(submission)
+    if there:
+        return f"{path}: {count(len(added), 'recording')} added", trouble
+    return f"wrote {path}: check its [limits]", trouble
 
 
 def propose_plan(submission: Submission, *, bench: Description | None = None) -> Plan:
@@ -389,37 +378,32 @@ NEEDED: dict[RecordingKind, tuple[str, ...]] = {
 TYPED = {"frequency_end": "frequency at the end"}
 
 
-@dataclass(frozen=True, kw_only=True)
-class WantedRecording:
-    """The few numbers with which a person describes a recording.
-
-    Attributes
-    ----------
-    seconds : duration in s, 1 to 120. For a dwell or sweep it is rounded to whole periods.
-    amplitude : amplitude in input units.
-    frequency : frequency in Hz of a dwell, or at the start of a sweep.
-    frequency_end : frequency in Hz at the end of a sweep.
-    cart : the cart that is released for a decay.
-    """
-
-    kind: RecordingKind
-    seconds: float
-    amplitude: float = 0.0
-    frequency: float = 0.0
-    frequency_end: float | None = None
-    cart: int = 1
-
-
-def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submission) -> Recording:
-    """Return the recording; all carts are free unless one is released by hand.
+def make_recording(
+    kind: RecordingKind,
+    *,
+    seconds: float,
+    amplitude: float = 0.0,
+    frequency: float = 0.0,
+    frequency_end: float = 0.0,
+    cart: int = 1,
+    plan: Plan,
+    submission: Submission,
+) -> Recording:
+    """Return a recording from its few numbers; all carts are free unless one is released by hand.
 
     A driven recording waits beforehand as long as the last driven recording of the plan.
+
+    Parameters
+    ----------
+    seconds : duration, 1 to 120. For a dwell or sweep it is rounded to whole periods.
+    amplitude : in input units.
+    frequency, frequency_end : in Hz, of a dwell, or at the start and the end of a sweep.
+    cart : the cart that is released for a decay.
 
     Raises
     ------
     ConfigError : the plan's limits do not allow it; the message names the number and the reason.
     """
-    kind, seconds = wanted.kind, wanted.seconds
     everyone = tuple(range(1, submission.system.carts + 1))
     low, high = FREQUENCIES
     if not _SHORTEST <= seconds <= _LONGEST:
@@ -427,24 +411,24 @@ def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submissio
         raise ConfigError(
             f"seconds: expected {expected}, found {seconds:g}; for longer ones edit plan.toml"
         )
-    named = {"frequency": wanted.frequency, "frequency_end": wanted.frequency_end or 0.0}
+    named = {"frequency": frequency, "frequency_end": frequency_end}
     for key in [key for key in named if key in NEEDED[kind]]:
         if not low <= named[key] <= high:
             name = TYPED.get(key, key)
             raise ConfigError(f"{name}: expected {low:g} to {high:g} Hz, found {named[key]:g}")
     if kind == "decay":
-        made = release_by_hand(wanted.cart, name=f"decay-{wanted.cart}", seconds=seconds)
+        made = release_by_hand(cart, name=f"decay-{cart}", seconds=seconds)
     else:
         driven = [one.settle for one in plan.recordings if one.amplitude]
-        cycles = _count_periods(seconds, wanted.frequency) if kind != "step" else EDGES // 2
+        cycles = _count_periods(seconds, frequency) if kind != "step" else EDGES // 2
         made = Recording(
             id=f"{kind}-1",
             kind=kind,
             carts=everyone,
             wave=_WAVES[kind],
-            amplitude=wanted.amplitude,
-            frequency=wanted.frequency if kind != "step" else cycles / seconds,
-            frequency_end=wanted.frequency_end if kind == "sweep" else None,
+            amplitude=amplitude,
+            frequency=frequency if kind != "step" else cycles / seconds,
+            frequency_end=frequency_end if kind == "sweep" else None,
             cycles=cycles,
             settle=driven[-1] if driven else 5.0,  # s, if the plan has no driven recording
         )

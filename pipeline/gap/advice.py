@@ -7,10 +7,11 @@ are there. If a recording was proposed (`experiments.discriminate`), the advice 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
+from pipeline.experiments.plan import Recording
 from pipeline.gap.limits import CLOSE_ERROR
 from pipeline.gap.types import (
     Advice,
@@ -119,17 +120,15 @@ def deciding_run(effect: Effect) -> str:
     return phrases("effects").text(f"in_{effect.deciding_run.replace(' ', '_')}")
 
 
-def proposed_recording(recording: Mapping[str, Any], *, drive: str) -> str:
-    """Return a proposed recording (a table of plan.toml) as a noun phrase."""
-    if "release" in recording:
-        return _WORDS.text(
-            "predicted_release", cart=recording["release"], note=recording.get("note", "")
-        )
+def proposed_recording(recording: Recording, *, drive: str) -> str:
+    """Return a proposed recording as a noun phrase."""
+    if recording.release:
+        return _WORDS.text("predicted_release", cart=recording.release, note=recording.note)
     return _WORDS.text(
         "predicted_driven",
-        wave=recording["wave"],
-        amplitude=f"{recording['amplitude']:g}",
-        frequency=f"{recording['frequency']:g}",
+        wave=recording.wave,
+        amplitude=f"{recording.amplitude:g}",
+        frequency=f"{recording.frequency:g}",
         drive=drive,
     )
 
@@ -149,7 +148,7 @@ def _advise(gap: Gap) -> Advice | None:
             aim=_AIMS[gap.verdict],
             between=sides,
             differ_in=_differ_in(sides),
-            kind=gap.proposal.recording["kind"],
+            kind=cast(RecordingKind, gap.proposal.recording.kind),  # a decay, step or sweep
             cart=prediction.cart,
             difference=float(np.abs(one - other).max()),
         )

@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from pipeline.arrays import Array
 from pipeline.errors import ConfigError
+from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.json_files import Number, computed, read_json, result, written
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain, Effect, effect_name
@@ -240,15 +241,14 @@ class Proposal:
 
     Attributes
     ----------
-    recording : the recording as a table of plan.toml.
-    limits : the limits of the plan for which the recording was chosen, by name.
+    limits : the limits of the plan for which the recording was chosen; None if a file lacks them.
     separation : root mean square difference, in units of the noise, that remains between the two
         contenders if one is refitted to the other.
     prediction : the contenders' predictions; None if the proposal was read from a file.
     """
 
-    recording: dict[str, Any]
-    limits: dict[str, float]
+    recording: Recording
+    limits: PlanLimits | None
     separation: float
     prediction: Prediction | None = None
 
@@ -371,12 +371,14 @@ class Gap:
     @computed(default=None)
     def next_recording(self) -> dict[str, Any] | None:
         """The recording that best distinguishes the contenders, as a table of plan.toml."""
-        return self.proposal and self.proposal.recording
+        if self.proposal is None:
+            return None
+        return self.proposal.recording.model_dump(mode="json", exclude_defaults=True)
 
     @computed(default=None)
     def next_limits(self) -> dict[str, float] | None:
         """The limits of plan.toml for which the recording was chosen."""
-        return self.proposal and self.proposal.limits
+        return self.proposal and self.proposal.limits and self.proposal.limits.model_dump()
 
     @computed(default=None)
     def separation(self) -> float | None:
@@ -465,7 +467,11 @@ class Gap:
         )
         proposal = None
         if recording is not None and separation is not None:
-            proposal = Proposal(recording=recording, limits=limits or {}, separation=separation)
+            proposal = Proposal(
+                recording=Recording.model_validate(recording),
+                limits=PlanLimits.model_validate(limits) if limits else None,
+                separation=separation,
+            )
         del own["chain"]  # also in the model
         bench = Setup(springs=springs, units=units)
         return cls(

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline.experiments.exploration import Turn, deciding_trace
+from pipeline.experiments.exploration import Turn, deciding_trace, list_explanations
 from pipeline.gap.types import Gap
 from pipeline.names import read_name
 from pipeline.output import write_file
@@ -155,28 +155,24 @@ def _whole_axes(ax: Axes, turns: Sequence[Turn], values: Sequence[float]) -> Non
     ax.set_ylim(10.0**low, 10.0 ** max(high, low + 1))
 
 
-def _explained(turn: Turn) -> list[str]:
+def _explained(gap: Gap) -> list[str]:
     """Return the competing explanations with their weights; a single explanation has no weight."""
-    if len(turn.explanations) < 2:
-        return [one.name for one in turn.explanations]
-    weights = [
-        f"{100 * one.weight:.0f} %" if one.weight >= 0.01 else "under 1 %"
-        for one in turn.explanations
-    ]
+    found = list_explanations(gap)
+    if len(found) < 2:
+        return [name for name, _ in found]
+    weights = [f"{100 * weight:.0f} %" if weight >= 0.01 else "under 1 %" for _, weight in found]
     weights[0] = f"in the model, {weights[0]}"
-    return [
-        f"{one.name} ({weight})" for one, weight in zip(turn.explanations, weights, strict=True)
-    ]
+    return [f"{name} ({weight})" for (name, _), weight in zip(found, weights, strict=True)]
 
 
 def _gap(page: Page, turns: Sequence[Turn]) -> list[Block]:
     """Return a table and a figure of what the model left unexplained after each turn."""
-    looked = [turn for turn in turns if turn.left is not None and turn.floor is not None]
+    looked = [(turn.seconds, turn.gap) for turn in turns if turn.gap is not None]
     if not looked:
         return []
     rows = [
-        (f"{turn.seconds:.0f} s", turn.verdict, capital("; ".join(_explained(turn))))
-        for turn in looked
+        (f"{seconds:.0f} s", gap.verdict, capital("; ".join(_explained(gap))))
+        for seconds, gap in looked
     ]
     table = page.table(_WORDS, "gap_table", rows, "lll")
     if len(looked) < 2:
@@ -184,11 +180,12 @@ def _gap(page: Page, turns: Sequence[Turn]) -> list[Block]:
     return [page.picture("left", _left_figure(turns, looked), _WORDS, "left"), table]
 
 
-def _left_figure(turns: Sequence[Turn], looked: Sequence[Turn]) -> Figure:
+def _left_figure(turns: Sequence[Turn], looked: Sequence[tuple[float, Gap]]) -> Figure:
     """Draw the unexplained share of the motion, and the noise floor, over time."""
     figure, (ax,) = panels(1.5)
-    seconds = [turn.seconds for turn in looked]
-    left, floor = ([100 * (getattr(t, name) or 0.0) for t in looked] for name in ("left", "floor"))
+    seconds = [at for at, _ in looked]
+    left = [100 * (gap.final or 0.0) for _, gap in looked]
+    floor = [100 * (gap.noise_floor or 0.0) for _, gap in looked]
     ax.plot(seconds, left, "o-", label="linear model and effects")
     ax.plot(seconds, floor, "--", color=SECOND, label="noise alone")
     _whole_axes(ax, turns, [*left, *floor])

@@ -32,8 +32,8 @@ _ENCODER_NOISE = 0.2  # counts of noise on a free cart's encoder, which flickers
 class VirtualCarts:
     """Carts that move under a motor and hands, one tick at a time.
 
-    What a run measures depends on the commands so far, but not on the ticks between the runs, which
-    a busy computer may change.
+    The readings of a run depend on the commands so far. They do not depend on the number of ticks
+    between runs, which changes if the computer is busy.
 
     Parameters
     ----------
@@ -452,7 +452,7 @@ class Server:
 
     @property
     def _stamp(self) -> int:
-        """The bench's clock in whole ms; in a run, rounding depends only on the ticks of the run."""
+        """The bench's clock in whole ms, rounded by the ticks since the last start of a run."""
         stamp, tick = self._run_began
         return stamp + int(1e3 * (self._ticks - tick) * self._period)
 

@@ -4,7 +4,7 @@ import pytest
 
 from pipeline.errors import ConfigError
 from pipeline.experiments.plan import add_recordings, load_plan
-from pipeline.experiments.propose import WantedRecording, add_recording, make_recording
+from pipeline.experiments.propose import add_recording, make_recording
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work
 
@@ -32,9 +32,7 @@ def test_a_recording_is_added_at_the_end_of_the_plan(work, kind, numbers, expect
     """A recording of any kind is added at the end of the plan, with a new id."""
     submission = load_submission(work)
     plan = load_plan(submission)
-    wanted = make_recording(
-        WantedRecording(kind=kind, seconds=20.0, **numbers), plan=plan, submission=submission
-    )
+    wanted = make_recording(kind, seconds=20.0, **numbers, plan=plan, submission=submission)
     new = add_recording(work, wanted)
     assert load_plan(submission).recordings == (*plan.recordings, new)
     assert {name: getattr(new, name) for name in expected} == expected
@@ -74,7 +72,7 @@ def test_a_number_outside_the_limits_is_refused_by_name(work, kind, numbers, wor
     plan = load_plan(submission)
     given = {"seconds": 20.0, **numbers}
     with pytest.raises(ConfigError, match=words):
-        make_recording(WantedRecording(kind=kind, **given), plan=plan, submission=submission)
+        make_recording(kind, **given, plan=plan, submission=submission)
     assert load_plan(submission) == plan
 
 
@@ -85,7 +83,10 @@ def test_whole_periods_last_as_long_as_typed(work, seconds, frequency, cycles):
     """100 s at 0.07 Hz become exactly 7 periods, despite the rounding of floats."""
     submission = load_submission(work)
     made = make_recording(
-        WantedRecording(kind="sine", seconds=seconds, amplitude=0.1, frequency=frequency),
+        "sine",
+        seconds=seconds,
+        amplitude=0.1,
+        frequency=frequency,
         plan=load_plan(submission),
         submission=submission,
     )

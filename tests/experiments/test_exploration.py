@@ -14,7 +14,11 @@ from pipeline.bench.events import Stopped
 from pipeline.bench.raw import known_commands
 from pipeline.errors import ConfigError, DataError
 from pipeline.experiments.discriminate import propose_for
-from pipeline.experiments.exploration import Exploration, Recorded, choose_recordings
+from pipeline.experiments.exploration import (
+    Exploration,
+    Recorded,
+    list_explanations,
+)
 from pipeline.experiments.information import (
     ErrorGoal,
     FisherInformation,
@@ -24,7 +28,6 @@ from pipeline.experiments.information import (
 )
 from pipeline.experiments.next_recordings import propose_candidates
 from pipeline.experiments.plan import (
-    Plan,
     PlanLimits,
     Recording,
     load_plan,
@@ -128,11 +131,12 @@ def test_an_exploration_names_the_effect_and_finds_the_carts(explored):
     """The exploration names the end stop on its cart, and finds every parameter correctly."""
     folder, turns, said, bench = explored
     last = turns[-1]
-    assert last.verdict == "named"
+    assert last.gap is not None
+    assert last.gap.verdict == "named"
     assert last.reached
     assert last.recorded == ("sweep-2",)  # the second sweep reaches the end stop
-    (explanation,) = last.explanations
-    assert "cart 1" in explanation.name
+    ((name, _),) = list_explanations(last.gap)
+    assert "cart 1" in name
     assert all(error is not None and error < 0.01 for error in last.errors.values())
     gap = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))
     assert [one["effect"] for one in gap["effects"]] == ["end_stop"]
@@ -176,7 +180,7 @@ def test_an_exploration_ends_before_it_exceeds_its_time(tmp_path):
     session = linear_session(tmp_path / "work")
     (turn,) = exploration(tmp_path / "work", session, seconds=90.0).run()
     assert turn.seconds <= 90.0
-    assert (turn.verdict, turn.reached) == ("", False)
+    assert (turn.gap, turn.reached) == (None, False)
     assert turn.errors
     assert "run out" in turn.summary
 
@@ -290,29 +294,30 @@ def test_an_added_recording_comes_next_whatever_its_id(tmp_path):
     assert offered == [step]
 
 
-def chosen(analysis: Analysis, plan: Plan, *, wanted=1e-7, seconds=900.0, refused=()):
-    """Return the recordings chosen for ζ, and why."""
-    return choose_recordings(
-        analysis,
-        None,
-        plan,
-        missing={"zeta": 0.1},
-        wanted=wanted,
-        seconds=seconds,
-        refused=refused,
-        commands=frozenset("c"),
-    )
+def chosen(analysis: Analysis, folder: Path, *, wanted=1e-7, seconds=900.0, refused=()):
+    """Return the recordings chosen for ζ within the limits of the plan, and why."""
+    goal = ErrorGoal(prefix="zeta", error=wanted)
+    known = exploration(folder, lambda ids: Recorded(), goal=goal, seconds=seconds)
+    known.known_commands = lambda folder: frozenset("c")
+    known.analysis, known.gap, known.refused = analysis, None, [*refused]
+    return known.choose({"zeta": 0.1})
+
+
+def planned_cart(folder: Path, *, limits: PlanLimits | None = None) -> tuple[Path, Analysis]:
+    """Return a recorded cart with a plan, and its analysis."""
+    submission = load_submission(a_recorded_cart(folder))
+    plan = propose_plan(submission)
+    save_plan(plan.model_copy(update={"limits": limits or plan.limits}), submission)
+    return folder, analyse(submission)
 
 
 def test_a_large_step_is_proposed_after_all_else_was_refused(tmp_path):
     """After all better proposals were refused, a large step is proposed."""
-    submission = load_submission(a_recorded_cart(tmp_path / "work"))
-    analysis = analyse(submission)
     limits = PlanLimits(input=100.0, travel=100.0)
-    plan = propose_plan(submission).model_copy(update={"limits": limits})
+    folder, analysis = planned_cart(tmp_path / "work", limits=limits)
     goal = find_goal("zeta", known := FisherInformation.of(analysis), feedback=None)
     refused = propose_candidates(known, limits=limits, commands=frozenset("c"), goal=goal)
-    (step,), _ = chosen(analysis, plan, refused=refused)
+    (step,), _ = chosen(analysis, folder, refused=refused)
     assert step.aim == "far"
 
 
@@ -320,18 +325,16 @@ def test_a_large_step_is_proposed_after_all_else_was_refused(tmp_path):
 @pytest.mark.sample
 def test_the_number_of_chosen_recordings_grows_with_the_data(tmp_path):
     """A tenth of the data so far is chosen at once, but no more than goal and time need."""
-    submission = load_submission(a_recorded_cart(tmp_path / "work"))
-    analysis = analyse(submission)
+    folder, analysis = planned_cart(tmp_path / "work")
     often = replace(analysis, records=analysis.records * 12)
-    plan = propose_plan(submission)
 
-    several, why = chosen(often, plan)
+    several, why = chosen(often, folder)
     assert len(several) == len(often.records) // 10 >= 3
     assert time_words(session_time(several)) in why
-    assert len(chosen(analysis, plan)[0]) == 1
-    assert len(chosen(often, plan, wanted=0.09)[0]) == 1
-    assert chosen(often, plan, seconds=session_time(several[:2]))[0] == several[:2]
-    assert len(chosen(often, plan, seconds=1.0)[0]) == 1
+    assert len(chosen(analysis, folder)[0]) == 1
+    assert len(chosen(often, folder, wanted=0.09)[0]) == 1
+    assert chosen(often, folder, seconds=session_time(several[:2]))[0] == several[:2]
+    assert len(chosen(often, folder, seconds=1.0)[0]) == 1
 
 
 @pytest.mark.slow
@@ -430,5 +433,5 @@ def test_the_large_step_and_the_far_sweep_are_made_only_once(tmp_path):
     """If drag keeps carts from the wanted distance, the recordings for it are still made once."""
     session = VirtualSession(tmp_path / "work", bench_of("quadratic_drag", seed=13))
     turns = exploration(tmp_path / "work", session, goal=ErrorGoal(), seconds=300.0).run()
-    assert [turn.verdict for turn in turns] == ["named"] * 3
+    assert [turn.gap and turn.gap.verdict for turn in turns] == ["named"] * 3
     assert [turn.recorded for turn in turns[1:]] == [("step-3",), ("sweep-2",)]

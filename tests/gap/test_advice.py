@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.arrays import Array
+from pipeline.experiments.plan import Recording
 from pipeline.gap.advice import advised
 from pipeline.gap.types import (
     AlternativeModel,
@@ -206,10 +207,12 @@ def test_the_advice_describes_the_proposed_recording(verdict, kind, extra):
         AlternativeModel(chain=CHAIN, terms=usual_terms(*keys), weight=0.5)
         for keys in (("quadratic_drag",), ("quadratic_drag", "cubic_spring"))
     )
-    recording = {"kind": kind, "wave": "square", "amplitude": 0.123, "frequency": 0.4, **extra}
+    recording = Recording(
+        id="apart", kind=kind, carts=(1, 2), wave="square", amplitude=0.123, frequency=0.4, **extra
+    )
     moved = np.sin(T) + np.array([[0.0], [0.07]]) * (T > 5.0)
     prediction = Prediction(pair=(0, 1), cart=2, t=T, u=T, positions=moved)
-    proposal = Proposal(recording=recording, limits={}, separation=4.0, prediction=prediction)
+    proposal = Proposal(recording=recording, limits=None, separation=4.0, prediction=prediction)
     gap = gap_of(verdict, ("coulomb_friction",), [("decay", FAR), ("decay", NEAR)])
     gap = advised(replace(gap, contenders=contenders, proposal=proposal))
 

@@ -6,30 +6,24 @@ from dataclasses import replace
 import numpy as np
 from numpy.testing import assert_allclose
 
-from pipeline.experiments.exploration import Turn, WeighedExplanation, deciding_trace, name_model
+from pipeline.experiments.exploration import Turn, deciding_trace, name_model
+from pipeline.gap.types import AlternativeModel, Gap
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, EffectTerm
 from pipeline.report.exploration import write_diary
-from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.gaps import make_gap, two_cart_analysis
 
 
-def make_turn(*weights: float) -> Turn:
-    """Return a turn with one explanation for each weight; the model uses the first explanation."""
+def make_turn(gap: Gap | None = None) -> Turn:
+    """Return a turn with this gap."""
     return Turn(
         seconds=30.0,
         recorded=("step-1",),
         errors={"K_1": 0.01},
-        verdict="ambiguous" if len(weights) > 1 else "named",
-        explanations=tuple(
-            WeighedExplanation(name=f"effect {i}", weight=weight)
-            for i, weight in enumerate(weights)
-        ),
-        left=0.1,
-        floor=0.01,
         reached=False,
         summary="K_1 is known to ± 1 % only",
+        gap=gap,
     )
 
 
@@ -38,13 +32,21 @@ def test_the_diary_marks_the_explanation_in_the_model(tmp_path):
 
     A weight far below the best is written as under 1 %; a single explanation has no weight.
     """
-    turns = [make_turn(1e-7, 1.0), make_turn(1.0)]
-    page = write_diary(turns, make_analysis(1), tmp_path, wanted=0.01).read_text(encoding="utf-8")
-    page = page.replace("\u00a0", " ")
-    first, second = re.findall(r"Effect 0[^<]*", page)
-    assert first.startswith("Effect 0 (in the model,")
-    assert re.findall(r"\d+ %", first) == ["1 %", "100 %"]
-    assert second == "Effect 0"
+    named = make_gap()
+    one, other = (
+        AlternativeModel(chain=model.chain, terms=model.terms, weight=weight)
+        for model, weight in ((named.model, 1e-7), (named.linear, 1.0))
+    )
+    disputed = replace(named, verdict="ambiguous", contenders=(one, other))
+    turns = [make_turn(disputed), make_turn(named)]
+    page = write_diary(turns, two_cart_analysis(), tmp_path, wanted=0.01).read_text("utf-8")
+    _, explained = page.replace("\u00a0", " ").split('<section id="explanations"')
+    first, second = re.findall(r"<td[^>]*>(Dry[^<]*)", explained)
+    assert re.findall(r"\((?:in the model, )?(?:under )?\d+ %\)", first) == [
+        "(in the model, under 1 %)",
+        "(100 %)",
+    ]
+    assert "%" not in second
 
 
 def test_effects_have_their_usual_names_in_the_diary():
@@ -63,7 +65,7 @@ def test_the_diary_gives_the_answer_first(tmp_path):
     gap = make_gap()
     runs = {trace.experiment for trace in gap.traces}
     turns = [
-        replace(make_turn(1.0), seconds=20.0, recorded=(run,), gap=gap) for run in sorted(runs)[:1]
+        replace(make_turn(), seconds=20.0, recorded=(run,), gap=gap) for run in sorted(runs)[:1]
     ]
     turns.append(replace(turns[0], seconds=50.0, recorded=("another",)))
 

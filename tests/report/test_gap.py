@@ -16,6 +16,7 @@ from typer.main import get_command
 
 from pipeline.cli import app
 from pipeline.errors import ConfigError
+from pipeline.experiments.plan import Recording
 from pipeline.gap.residual import residual_forces
 from pipeline.gap.types import (
     Alternative,
@@ -275,8 +276,10 @@ def test_two_models_are_named_by_their_differences(first, second, only, legend):
         AlternativeModel(chain=CHAIN, terms=usual_terms(*keys), weight=0.5)
         for keys in (first, second)
     )
-    recording = {"wave": "triangle", "amplitude": 0.6, "frequency": 0.12}
-    proposal = Proposal(recording=recording, limits={}, separation=42.0, prediction=PREDICTION)
+    recording = Recording(
+        id="apart", kind="sweep", carts=(1, 2), wave="triangle", amplitude=0.6, frequency=0.12
+    )
+    proposal = Proposal(recording=recording, limits=None, separation=42.0, prediction=PREDICTION)
     gap = replace(make_gap("partial"), contenders=contenders, proposal=proposal)
     blocks = sections(build_gap_document(gap, two_cart_analysis()))["apart"].blocks
 

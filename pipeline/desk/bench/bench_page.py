@@ -241,14 +241,7 @@ def _note_plan(ask: PageRequest) -> None:
 
 def _read_recording(typed: Mapping[str, str], submission: Submission) -> Recording:
     """Return the custom recording of the form."""
-    from pipeline.experiments.propose import (
-        KINDS,
-        NEEDED,
-        TYPED,
-        WantedRecording,
-        current_plan,
-        make_recording,
-    )
+    from pipeline.experiments.propose import KINDS, NEEDED, TYPED, current_plan, make_recording
 
     if typed["kind"] not in KINDS:
         raise ConfigError(f"kind: expected {', '.join(KINDS)}, found {typed['kind']!r}")
@@ -256,15 +249,16 @@ def _read_recording(typed: Mapping[str, str], submission: Submission) -> Recordi
     if blank := [TYPED.get(key, key) for key in NEEDED[kind] if not typed[key].strip()]:
         raise ConfigError(f"{' and '.join(blank)}: the field is empty")
     carts = submission.system.carts
-    wanted = WantedRecording(
-        kind=kind,
+    return make_recording(
+        kind,
         seconds=read_number(typed["seconds"], name="duration"),
         amplitude=read_number(typed["amplitude"], name="amplitude"),
         frequency=read_number(typed["frequency"], name="frequency"),
-        frequency_end=read_number(typed["frequency_end"], name="frequency at the end") or None,
+        frequency_end=read_number(typed["frequency_end"], name="frequency at the end"),
         cart=read_whole_number(typed["cart"] or "1", name="cart", least=1, most=carts),
+        plan=current_plan(submission),
+        submission=submission,
     )
-    return make_recording(wanted, plan=current_plan(submission), submission=submission)
 
 
 def _scale_bars(found: Mapping[str, Any]) -> list[dict[str, Any]]:
