@@ -70,12 +70,13 @@ def run(seed: int) -> dict:
         gap_file = folder / "gap" / "gap.json"
         gap = json.loads(gap_file.read_text(encoding="utf-8")) if gap_file.exists() else {}
     found = [counted_of(effect) for effect in gap.get("effects", ())]
+    last = turns[-1].gap
     return row | {
-        "verdicts": [turn.verdict for turn in turns],
+        "verdicts": [turn.gap.verdict if turn.gap else "" for turn in turns],
         "recorded": [list(turn.recorded) for turn in turns],
         "found": sorted(map(list, found)),
         "reached": turns[-1].reached,
-        "left": (turns[-1].left or 0.0) / (turns[-1].floor or 1.0),
+        "left": (last.final or 0.0) / (last.noise_floor or 1.0) if last else 0.0,
         "errors": off(gap, drawn),
         "worst": max(e or np.inf for e in turns[-1].errors.values()),
         "seconds": turns[-1].seconds,

@@ -23,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from pipeline.experiments.information import FisherInformation
+from pipeline.experiments.information import FisherInformation, largest_amplitude
 from pipeline.experiments.next_recordings import choose_next
 from pipeline.experiments.plan import Plan, Recording
 from pipeline.experiments.propose import FURTHEST, propose_plan, renamed, rounded, rounded_down
@@ -76,7 +76,9 @@ def log_spaced(known: FisherInformation, plan: Plan, *, n: int) -> list[Recordin
             cycles=ceil(hertz * (wait + steady_time(hertz))),
             settle=rounded(settling_wait(known.chain, time_constants=SETTLED)),
         )
-        size = known.at_its_limits(dwell, limits=plan.limits, share=FURTHEST)
+        size = largest_amplitude(
+            known.chain, dwell, limits=plan.limits, share=FURTHEST, period=known.sample_time
+        )
         dwells.append(dwell.model_copy(update={"amplitude": rounded_down(size)}))
     return dwells
 

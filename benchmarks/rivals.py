@@ -78,7 +78,7 @@ def told(gap: Gap) -> dict:
             for f in gap.effects
         ),
         "left": round(gap.final / gap.noise_floor, 3),
-        "proposed": gap.proposal and [gap.proposal.recording["id"], gap.proposal.separation],
+        "proposed": gap.proposal and [gap.proposal.recording.id, gap.proposal.separation],
     }
 
 
