@@ -124,11 +124,13 @@ def proposed_recording(recording: Recording, *, drive: str) -> str:
     """Return a proposed recording as a noun phrase."""
     if recording.release:
         return _WORDS.text("predicted_release", cart=recording.release, note=recording.note)
+    end = recording.frequency_end
     return _WORDS.text(
-        "predicted_driven",
+        "predicted_driven" if end is None else "predicted_chirp",
         wave=recording.wave,
         amplitude=f"{recording.amplitude:g}",
         frequency=f"{recording.frequency:g}",
+        end=f"{end or 0.0:g}",
         drive=drive,
     )
 

@@ -222,9 +222,9 @@ def _noise(gap: Gap) -> str:
 
 def _errors(gap: Gap) -> str:
     errors = WORDS.text("errors", noise=_noise(gap), **shares(gap))
-    if not gap.left:
-        return errors
     least = max(gap.noise_floor, gap.repeatability or 0.0)
+    if not gap.left or gap.final <= NOTHING * least:
+        return errors
     worst = gap.left[0]
     return WORDS.text(
         "left",

@@ -199,7 +199,12 @@ def test_no_effect_is_added_to_a_sufficient_linear_model_or_a_wrong_set_up():
 
 @pytest.mark.parametrize("verdict", ["ambiguous", "partial", "named", "unexplained"])
 @pytest.mark.parametrize(
-    ("kind", "extra"), [("step", {}), ("decay", {"release": 2, "note": "let go at 0.5"})]
+    ("kind", "extra"),
+    [
+        ("step", {}),
+        ("sweep", {"frequency_end": 7.25}),
+        ("decay", {"release": 2, "note": "let go at 0.5"}),
+    ],
 )
 def test_the_advice_describes_the_proposed_recording(verdict, kind, extra):
     """If a recording is proposed, the advice gives its kind, and by how much the models differ."""
@@ -221,9 +226,10 @@ def test_the_advice_describes_the_proposed_recording(verdict, kind, extra):
     assert (advice.kind, advice.cart, advice.change) == (kind, 2, None)
     assert advice.difference == pytest.approx(0.07)
     assert [[e.effect.key for e in side] for side in advice.between] == [["cubic_spring"], []]
-    assert ("0.123" in gap.next_experiment) == (not extra)
+    assert ("0.123" in gap.next_experiment) == (kind != "decay")
+    assert ("7.25" in gap.next_experiment) == (kind == "sweep")
     assert "0.070" in gap.next_experiment
-    assert ("let go at 0.5" in gap.next_experiment) == bool(extra)
+    assert ("let go at 0.5" in gap.next_experiment) == (kind == "decay")
     assert json_text(read_gap(text := json_text(gap))) == text
 
 

@@ -141,6 +141,8 @@ def test_where_the_error_is_left_is_said():
         for fact in ("4.1 times", "step-b, cart 2", "2.00 to 2.60"):
             assert fact in said
         assert (what in said) == (what != "throughout")
+    only_noise = terminal_verdict(replace(gap, verdict="ambiguous", noise_floor=gap.final))
+    assert "2.00 to 2.60" not in only_noise
 
 
 def test_the_verdict_none_says_what_it_covers():
