@@ -52,6 +52,16 @@ def test_nothing_heavy_is_loaded_until_it_is_asked_for():
         pipeline.analyze  # noqa: B018
 
 
+@pytest.mark.parametrize("module", ["notebook", "report.make_report", "grading.batch.grade_class"])
+def test_the_compiled_simulator_is_loaded_only_for_a_simulation(module):
+    """A report or a grade does not wait for the compiler of the simulator."""
+    code = f"import sys, pipeline.{module}; print('numba' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True
+    )
+    assert done.stdout.strip() == "False"
+
+
 def test_the_system_is_the_identified_chain(lab):
     """States, input and outputs of the system are named; A to D are those of results.json."""
     system = lab.system

@@ -584,17 +584,19 @@ _HIDDEN = 1e-9  # share of the strongest direction; weaker ones count as unknown
 def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> GapFit:
     """Return the fit with the covariance of its parameters, or without it if the model diverges.
 
-    If the fit used the same friction for all runs, the standard errors do not include the variation
-    of friction.
+    The standard errors include the variation of dry friction from run to run, as the fit learnt it.
+    If the fit used the same friction for all runs, the variation is estimated from the residuals
+    (R. DerSimonian, N. Laird, Controlled Clinical Trials 7 (1986), 177-188).
     """
 
-    def weigh(job: tuple[int, tuple[GapRun, Nuisance]]) -> Array:
+    def weigh(job: tuple[int, tuple[GapRun, Nuisance]]) -> _Weighed:
         index, (run, nuisance) = job
         # Seeded by the run's index, so that each run has its own draws.
         rng = np.random.default_rng([0, index])
         return _weigh(fit, run, nuisance, rng=rng)
 
-    told = np.sum(list(mapper(weigh, enumerate(zip(runs, fit.nuisance, strict=True)))), axis=0)
+    weighed = list(mapper(weigh, enumerate(zip(runs, fit.nuisance, strict=True))))
+    told = np.sum([one.told for one in weighed], axis=0)
     if not np.all(np.isfinite(told)):
         return fit
     held = anchor(runs, fit.theta.size)[:, :-1]
@@ -611,19 +613,31 @@ def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> Gap
     # The encoders cause no error in a direction that no run determines; its variance is that of
     # H⁻¹.
     np.fill_diagonal(cov, np.maximum(np.diag(cov), least))
-    return replace(fit, covariance=cov)
+    return replace(fit, covariance=cov + _varying_friction(fit, weighed))
 
 
-def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator) -> Array:
-    """Return H, S from encoder errors, and S from the residual's correlation, each (size, size).
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Weighed:
+    """What one run tells about the parameters.
 
-    All of them are NaN if the model diverges at these parameters or next to them.
+    Attributes
+    ----------
+    told : H, S from encoder errors, and S from the residual's correlation, each (size, size). All
+        of them are NaN if the model diverges at these parameters or next to them.
+    factors : for each cart with dry friction, the deviation of its friction in this run from that
+        of the model, relative, and the information about it.
     """
+
+    told: Array
+    factors: dict[int, tuple[float, float]] = field(default_factory=dict)
+
+
+def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator) -> _Weighed:
     thin, inflate = run.thin, fit.inflation
-    layout = layout_of(fit.structure, thin, scatter_free=fit.scattered)
+    layout = layout_of(fit.structure, thin, scatter_free=True)
     columns = columns_of(fit, thin, nuisance, layout)
     if not np.all(np.isfinite(columns)):
-        return np.full((3, fit.theta.size, fit.theta.size), np.nan)
+        return _Weighed(told=np.full((3, fit.theta.size, fit.theta.size), np.nan))
     columns = columns * thin.weight / thin.sigma[:, None]
     starts = len(layout.x0) + len(layout.v0)
     local = starts + len(layout.scatter) + len(layout.zero)
@@ -637,15 +651,59 @@ def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Gener
     wide = 1 + local - starts  # the last column is the residual
     firm = run_prior(layout, thin, nuisance, wide, spread=fit.spread, inflate=inflate)
     prior[len(own) :, len(own) :] = firm[:, :-1]
+    friction = N[:, len(own) : len(own) + len(layout.scatter)]
+    if not fit.scattered:
+        kept = np.delete(np.arange(N.shape[1]), len(own) + np.arange(len(layout.scatter)))
+        N, prior = N[:, kept], prior[np.ix_(kept, kept)]
     J = columns[local:-1].reshape(fit.theta.size, -1).T
-    known = np.concatenate([J, np.zeros((len(prior), fit.theta.size))])
-    taken = np.linalg.lstsq(np.concatenate([N, prior]), known, rcond=None)[0]
-    H = J.T @ (J - N @ taken)
-    J = (J - N @ taken).T.reshape(columns[local:-1].shape)
+    known = np.hstack([J, friction])
+    held = np.concatenate([known, np.zeros((len(prior), known.shape[1]))])
+    known = known - N @ np.linalg.lstsq(np.concatenate([N, prior]), held, rcond=None)[0]
+    left, friction_left = known[:, : fit.theta.size], known[:, fit.theta.size :]
+    H = J.T @ left
+    told = friction_left.T @ columns[-1].ravel()
+    sizes = (friction_left**2).sum(0)
+    J = left.T.reshape(columns[local:-1].shape)
     weight = J * thin.weight / thin.sigma[:, None]
     errors = np.array(list(_errors(fit, run, nuisance, rng=rng)))
     scores = np.tensordot(errors, weight, axes=((1, 2), (1, 2)))
-    return np.stack([H, scores.T @ scores / _DRAWS, score_covariance(columns[-1], J)])
+    return _Weighed(
+        told=np.stack([H, scores.T @ scores / _DRAWS, score_covariance(columns[-1], J)]),
+        factors={
+            i: (float(told[j] / sizes[j]), float(sizes[j]))
+            for j, i in enumerate(layout.scatter)
+            if sizes[j] > 0.0
+        },
+    )
+
+
+def _varying_friction(fit: GapFit, weighed: Sequence[_Weighed]) -> Array:
+    """Return the covariance (size, size) that the variation of dry friction between runs causes.
+
+    All dry friction of a cart has the same factor in a run. The recordings show the friction only
+    multiplied by the mean of the factors.
+    """
+    out = np.zeros((fit.theta.size, fit.theta.size))
+    for i in {i for one in weighed for i in one.factors}:
+        factors, weight = np.array([one.factors[i] for one in weighed if i in one.factors]).T
+        if fit.scattered:
+            variance = float(fit.spread[i]) ** 2 / weight.size
+        else:
+            share = weight / weight.sum()
+            variance = _between_runs(factors, weight) * float(share @ share)
+        direction = fit.structure.friction_direction(i)
+        out += variance * np.outer(direction, direction)
+    return out
+
+
+def _between_runs(factors: Array, weight: Array) -> float:
+    """Return the variance of factors between runs, beyond that of their own errors."""
+    if factors.size == 1:
+        return 0.0
+    mean = float(weight @ factors) / float(weight.sum())
+    excess = float(weight @ (factors - mean) ** 2) - (factors.size - 1)
+    size = float(weight.sum() - (weight @ weight) / weight.sum())
+    return max(0.0, excess / size)
 
 
 def _by_piece(columns: Array, run: GapRun) -> Array:

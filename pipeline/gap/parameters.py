@@ -25,7 +25,7 @@ from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain, Effect, EffectTerm, PlaceScales, chain_scales
 from pipeline.plant.simulator import sensitivity
 from pipeline.plant.simulator.kernel import StartState, simulate
-from pipeline.plant.simulator.tables import Cart, Tables
+from pipeline.plant.simulator.tables import DRY, Cart, Tables
 
 # ------------------------------------------------------- the parameters of a model as one vector
 
@@ -126,6 +126,15 @@ class Structure:
         """Return the structure without some of its effects, given by index."""
         kept = tuple(c for i, c in enumerate(self.effects) if i not in indices)
         return Structure(springs=self.springs, effects=kept)
+
+    def friction_direction(self, i: int) -> Array:
+        """Return the direction of the vector along which the dry friction of cart i grows."""
+        sizes = [np.zeros(self.base_size)]
+        for c in self.effects:
+            columns = c.effect.columns(dict.fromkeys(c.effect.names, 1.0))
+            mine = c.effect.place == "cart" and c.place == i + 1
+            sizes.append(np.array([float(mine and column in DRY) for column in columns]))
+        return np.concatenate(sizes)
 
     # ------------------------------------------------------------ the vector
 

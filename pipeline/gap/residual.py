@@ -287,6 +287,7 @@ def _power(unit: str, power: float) -> str:
 
 LIBRARY = (
     _Term("1", lambda x, v, u: np.ones_like(x)),
+    _Term("x^2", lambda x, v, u: x**2, x=2),
     _Term("x|x|", lambda x, v, u: x * np.abs(x), x=2),
     _Term("x^3", lambda x, v, u: x**3, x=3),
     _Term("sign v", lambda x, v, u: np.sign(v)),
@@ -294,8 +295,11 @@ LIBRARY = (
     _Term("v|v|", lambda x, v, u: v * np.abs(v), v=2),
     _Term("v^3", lambda x, v, u: v**3, v=3),
     _Term("|v|", lambda x, v, u: np.abs(v), v=1),
+    _Term("x v", lambda x, v, u: x * v, x=1, v=1),
     _Term("x^2 v", lambda x, v, u: x**2 * v, x=2, v=1),
+    _Term("x sign v", lambda x, v, u: x * np.sign(v), x=1),
     _Term("|x| sign v", lambda x, v, u: np.abs(x) * np.sign(v), x=1),
+    _Term("|u|", lambda x, v, u: np.abs(u), u=1),
     _Term("|u| sign v", lambda x, v, u: np.abs(u) * np.sign(v), u=1),
     _Term("u x", lambda x, v, u: u * x, x=1, u=1),
     _Term("u|u|", lambda x, v, u: u * np.abs(u), u=2),

@@ -127,8 +127,8 @@ def list_effects(
     """Return the effects of the final fit, each with its step on the path and its rivals."""
     structure, chosen = final.structure, path[-1]
     same_size = {h.key: h for h in found if len(h.key) == len(chosen.key)} | {chosen.key: chosen}
-    lowest = min(h.bic for h in same_size.values())
-    weight = {key: float(np.exp(-0.5 * (h.bic - lowest))) for key, h in same_size.items()}
+    lowest = min(h.bic_of_all for h in same_size.values())
+    weight = {key: float(np.exp(-0.5 * (h.bic_of_all - lowest))) for key, h in same_size.items()}
     total, std = sum(weight.values()), None
     if final.covariance is not None:
         std = np.sqrt(np.diag(final.covariance)) * structure.physical_derivative(final.theta)
@@ -147,7 +147,7 @@ def list_effects(
         ]
         # Each effect is listed once, with the best hypothesis in which it takes this one's place.
         by_name: dict[tuple[str, int], Hypothesis] = {}
-        for h in sorted(rivals, key=lambda h: h.bic):
+        for h in sorted(rivals, key=lambda h: h.bic_of_all):
             by_name.setdefault(_stand_in(added, h.key - rest), h)
         # If the cost has many narrow minima, its curvature does not give the standard error.
         rugged = term.effect.contact and final.chi > AT_FLOOR

@@ -321,9 +321,9 @@ def read_blocks(
 def _find_blocks(
     lines: Sequence[tuple[int, str]], layout: Layout, *, source: str, line: str
 ) -> Iterator[Block]:
-    sample = [layout.signature(line) for _, line in lines[:_SNIFFED_LINES]]
-    start, length = _start(sample[:_FEW_LINES])
-    start = start if length >= _LONG else _start(sample)[0]
+    start, length = _start([layout.signature(line) for _, line in lines[:_FEW_LINES]])
+    if length < _LONG:
+        start = _start([layout.signature(line) for _, line in lines[:_SNIFFED_LINES]])[0]
     rows = [row for _, row in lines[start:]]
     values = _numbers(rows, layout, len(layout.split(rows[0])))
     starts = [start, len(lines)]

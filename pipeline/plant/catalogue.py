@@ -182,6 +182,34 @@ CUBIC_SPRING = Effect(
 )
 
 
+ASYMMETRIC_SPRING = Effect(
+    key="asymmetric_spring",
+    title="Spring that is stiffer on one side",
+    sentence="The spring becomes stiffer the more it is stretched, and softer the more it is "
+    "compressed, or the other way round.",
+    place="spring",
+    law=ForceLaw("b * d**2"),
+    parameters=(
+        EffectParameter(
+            "coefficient",
+            "b",
+            "input/position^2",
+            scale="stiffness / position",
+            typical=0.2,
+            signed=True,
+            neutral=0.0,
+        ),
+    ),
+    fingerprint="The swings are longer to one side than to the other, and the centre of a large "
+    "oscillation is off the rest position.",
+    deciding_run="Steps of the same size in both directions: the settled positions differ.",
+    reference="A. H. Nayfeh, D. T. Mook, Nonlinear Oscillations, section 2.3",
+    axis="stretch",
+    equivalent="The same effect with the opposite sign in the other wall spring, if there is only "
+    "one cart.",
+)
+
+
 SLACK_SPRING = Effect(
     key="slack_spring",
     title="A spring with a jump in its stiffness",
@@ -342,7 +370,15 @@ BACKLASH = Effect(
         ("g", "m_m", "e")
     ),  # e: speed after an impact, divided by the speed before it
     parameters=(
-        EffectParameter("gap", "g", "position", scale="position", typical=0.08, neutral=0.0),
+        EffectParameter(
+            "gap",
+            "g",
+            "position",
+            scale="position",
+            typical=0.08,
+            neutral=0.0,
+            upper=1.0,  # in a wider gap, the motor would hardly reach the cart
+        ),
         EffectParameter(
             "motor_mass",
             "m_m",
@@ -422,14 +458,22 @@ END_STOP = Effect(
     law=ContactLaw("-k * (x - p) - c * v", past="p"),
     growth=FitCoordinates(("k", "p", "c")),
     parameters=(
-        EffectParameter("position", "p", "position", scale="position", typical=0.8, side=True),
+        EffectParameter(
+            "position",
+            "p",
+            "position",
+            scale="position",
+            typical=0.8,
+            side=True,
+            lower=0.2,  # a stop nearer to the rest position would leave no motion
+        ),
         EffectParameter(
             "stiffness",
             "k",
             "input/position",
             scale="stiffness",
             typical=20.0,
-            lower=0.05,
+            lower=0.5,  # a softer stop is a spring
             upper=3000.0,
             neutral=0.0,
         ),
@@ -527,6 +571,7 @@ CATALOGUE: tuple[Effect, ...] = (
     QUADRATIC_DRAG,
     FORCE_OFFSET,
     CUBIC_SPRING,
+    ASYMMETRIC_SPRING,
     SLACK_SPRING,
     COUPLING_DAMPER,
     DRIVE_DAMPING,

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from pipeline.errors import ConfigError, DataError
 from pipeline.output import write_file
 from pipeline.plant.effect import AugmentedChain
-from pipeline.plant.export import Description, c_sources, fmu, matlab_source
 from pipeline.results import Analysis
 from pipeline.submission.toml import read_text
 
@@ -60,6 +59,9 @@ def save_model(
 
     A model that would need future inputs is not written; the sentence then says why.
     """
+    # Imported late, because it loads the compiled simulator.
+    from pipeline.plant.export import Description, c_sources, fmu, matlab_source
+
     driven = [record.input_scale for record in analysis.records if record.u is not None]
     sign_reversed = sum(scale > 0 for scale in driven) < sum(scale < 0 for scale in driven)
     try:

@@ -13,6 +13,7 @@ SIZES = {
     "quadratic_drag": {"coefficient": 3e-5},
     "force_offset": {"force": 0.004},
     "cubic_spring": {"coefficient": 0.02},
+    "asymmetric_spring": {"coefficient": 0.008},
     "slack_spring": {"stiffness_change": 0.8, "stretch": 0.15},
     "coupling_damper": {"coefficient": 3e-4},
     "drive_damping": {"coefficient": 3e-4},

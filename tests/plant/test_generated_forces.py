@@ -103,6 +103,7 @@ def test_a_law_vanishes_with_its_coefficients(effect):
         ("quadratic_drag", "f = -q v |v|"),
         ("presliding_friction", r"f = -F z, \quad \dot z = (v - |v| z)/\delta"),
         ("cubic_spring", "f = k d + a d^3"),
+        ("asymmetric_spring", "f = k d + b d^2"),
         ("cogging", r"f = F \sin(2 \pi x_1/\lambda + \phi)"),
         ("drive_damping", r"f = -c v_1 \text{ while } u \ne 0"),
         ("slack_spring", r"f = k d + r k (d - s) \text{ past } s"),

@@ -19,7 +19,7 @@ _CONTACTS = ("backlash", "end_stop")
 _CART = (
     "m c coulomb excess stribeck dahl delta mu drag offset stop stop_k stop_c gain hm hk hc"
 ).split()
-_SPRING = "k cubic change stretch coupling".split()
+_SPRING = "k cubic change stretch coupling square".split()
 _DRIVE = "dead limit delay lag braking gap motor contact contact_c cog pitch phase".split()
 
 
@@ -136,6 +136,7 @@ def _motion(cart, spring, drive, hands, free, t, times, command, x0, v0, scatter
             rate = (w[j] if j < n else 0.0) - (w[j - 1] if j > 0 else 0.0)
             d = right - left
             tension = spring[j, 0] * d + spring[j, 1] * d**3 + spring[j, 4] * rate
+            tension += spring[j, 5] * d**2
             if spring[j, 3] >= 0.0 and d > spring[j, 3]:
                 tension += spring[j, 2] * spring[j, 0] * (d - spring[j, 3])
             if spring[j, 3] < 0.0 and d < spring[j, 3]:
@@ -288,6 +289,8 @@ def _hide(effect: Hidden, cart: np.ndarray, spring: np.ndarray, drive: np.ndarra
             cart[i, 14:17] = p["mass"], p["stiffness"], p["damping"]
         case "cubic_spring":
             spring[i, 1] = p["coefficient"]
+        case "asymmetric_spring":
+            spring[i, 5] = p["coefficient"]
         case "slack_spring":
             spring[i, 2:4] = p["stiffness_change"], p["stretch"]
         case "coupling_damper":

@@ -40,6 +40,7 @@ EFFECTS = (
     "sensor_gain",
     "extra_mode",
     "cogging",
+    "asymmetric_spring",
 )
 
 
@@ -330,6 +331,9 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng, wide=
             size = draw(0.08, 0.9 if wide else 0.3) if sign > 0 else draw(0.04, 0.12)
             a = s * sign * size * k[j] / stretch**2
             return Hidden(effect=name, place=j + 1, parameters={"coefficient": a})
+        case "asymmetric_spring":
+            b = s * sign * draw(0.08, 0.5 if wide else 0.3) * k[j] / stretch
+            return Hidden(effect=name, place=j + 1, parameters={"coefficient": b})
         case "slack_spring":
             r = s * (draw(0.4, 1.5) if rng.random() < 0.6 else -draw(0.3, 0.6))
             side = sign * draw(0.15, 0.5) * stretch

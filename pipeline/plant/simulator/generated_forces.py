@@ -35,6 +35,8 @@ def spring_force(spring, j, d, rate):
     f = 0.0
     if spring[j, Spring.CUBIC_SPRING_COEFFICIENT] != 0.0:
         f += d**3 * spring[j, Spring.CUBIC_SPRING_COEFFICIENT]
+    if spring[j, Spring.ASYMMETRIC_SPRING_COEFFICIENT] != 0.0:
+        f += d**2 * spring[j, Spring.ASYMMETRIC_SPRING_COEFFICIENT]
     return f
 
 
@@ -44,6 +46,8 @@ def spring_slopes(spring, j, d, rate):
     by_x = by_v = 0.0
     if spring[j, Spring.CUBIC_SPRING_COEFFICIENT] != 0.0:
         by_x += 3 * d**2 * spring[j, Spring.CUBIC_SPRING_COEFFICIENT]
+    if spring[j, Spring.ASYMMETRIC_SPRING_COEFFICIENT] != 0.0:
+        by_x += 2 * d * spring[j, Spring.ASYMMETRIC_SPRING_COEFFICIENT]
     return by_x, by_v
 
 
@@ -212,6 +216,9 @@ def longest_step(cart, spring, drive):
             smooth |= ON_CARTS
     for j in range(spring.shape[0]):
         if spring[j, Spring.CUBIC_SPRING_COEFFICIENT] != 0.0:
+            longest = min(longest, 0.0025)
+            smooth |= ON_SPRINGS
+        if spring[j, Spring.ASYMMETRIC_SPRING_COEFFICIENT] != 0.0:
             longest = min(longest, 0.0025)
             smooth |= ON_SPRINGS
     if drive[Drive.DRIVE_DAMPING_COEFFICIENT] != 0.0:

@@ -19,22 +19,24 @@ class EffectKind(IntEnum):
     QUADRATIC_DRAG = 4
     FORCE_OFFSET = 5
     CUBIC_SPRING = 6
-    SLACK_SPRING = 7
-    COUPLING_DAMPER = 8
-    DRIVE_DAMPING = 9
-    DEAD_ZONE = 10
-    SATURATION = 11
-    INPUT_DELAY = 12
-    ACTUATOR_LAG = 13
-    BACKLASH = 14
-    COGGING = 15
-    END_STOP = 16
-    SENSOR_GAIN = 17
-    EXTRA_MODE = 18
+    ASYMMETRIC_SPRING = 7
+    SLACK_SPRING = 8
+    COUPLING_DAMPER = 9
+    DRIVE_DAMPING = 10
+    DEAD_ZONE = 11
+    SATURATION = 12
+    INPUT_DELAY = 13
+    ACTUATOR_LAG = 14
+    BACKLASH = 15
+    COGGING = 16
+    END_STOP = 17
+    SENSOR_GAIN = 18
+    EXTRA_MODE = 19
 
 
 # For each kind, the coordinates that are zero without the effect.
 COEFFICIENTS = (
+    (0,),
     (0,),
     (0,),
     (0,),
@@ -57,6 +59,7 @@ COEFFICIENTS = (
 )
 ON_SPRING = (
     EffectKind.CUBIC_SPRING,
+    EffectKind.ASYMMETRIC_SPRING,
     EffectKind.SLACK_SPRING,
     EffectKind.COUPLING_DAMPER,
 )
@@ -120,6 +123,13 @@ def terms(kind, p, o, x, v, k, u, on, out):
         x0 = x**3
         out[0] = p[o] * x0
         out[1] = 3 * p[o] * x**2
+        out[2] = 0
+        out[3] = 0
+        out[4] = x0
+    elif kind == EffectKind.ASYMMETRIC_SPRING:
+        x0 = x**2
+        out[0] = p[o] * x0
+        out[1] = 2 * p[o] * x
         out[2] = 0
         out[3] = 0
         out[4] = x0

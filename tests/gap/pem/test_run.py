@@ -25,6 +25,7 @@ SIZES = {
     EffectKind.QUADRATIC_DRAG: lambda u, x, m, k: (2e-5,),
     EffectKind.FORCE_OFFSET: lambda u, x, m, k: (0.02 * u,),
     EffectKind.CUBIC_SPRING: lambda u, x, m, k: (0.01 * k / x**2,),
+    EffectKind.ASYMMETRIC_SPRING: lambda u, x, m, k: (0.01 * k / x,),
     EffectKind.SLACK_SPRING: lambda u, x, m, k: (0.3 * k, 0.4 * x),
     EffectKind.COUPLING_DAMPER: lambda u, x, m, k: (1e-4,),
     EffectKind.DRIVE_DAMPING: lambda u, x, m, k: (1e-4,),
