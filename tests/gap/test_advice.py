@@ -23,6 +23,7 @@ from pipeline.gap.types import (
 from pipeline.json_files import json_text
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.results import Check
+from pipeline.setup import Setup
 from tests.helpers.gaps import CHAIN, make_gap, usual_terms
 
 T: Array = np.arange(0.0, 8.0, 0.01)
@@ -181,6 +182,17 @@ def test_a_named_effect_needs_more_only_if_it_is_unsure_or_untested(key, error, 
     assert (advice.aim, advice.kind, advice.change) == wanted
     assert (advice.parameter in values) == (wanted[0] == "sharpen")
     assert [[e.effect.key for e in side] for side in advice.between] == [[key]]
+
+
+def test_a_bench_with_one_cart_has_no_other_cart_to_hold():
+    """Runs with other carts held are asked for only if there are other carts."""
+    two = gap_of("named", ("force_offset",), [("decay", {1: 1.0})])
+    one = replace(two, bench=Setup(springs=(True, True)))
+
+    assert [found and found.kind for found in (advised(two).advice, advised(one).advice)] == [
+        "held",
+        None,
+    ]
 
 
 def test_no_effect_is_added_to_a_sufficient_linear_model_or_a_wrong_set_up():
