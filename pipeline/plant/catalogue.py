@@ -202,7 +202,7 @@ ASYMMETRIC_SPRING = Effect(
     ),
     fingerprint="The swings are longer to one side than to the other, and the centre of a large "
     "oscillation is off the rest position.",
-    deciding_run="Steps of the same size in both directions: the settled positions differ.",
+    deciding_run="both sides",
     reference="A. H. Nayfeh, D. T. Mook, Nonlinear Oscillations, section 2.3",
     axis="stretch",
     equivalent="The same effect with the opposite sign in the other wall spring, if there is only "
