@@ -85,7 +85,9 @@ class GapFit(GapModel):
 
     Attributes
     ----------
-    covariance : covariance (size, size) of the parameter vector; None before the search ends.
+    covariance : covariance (size, size) of the parameter vector, if dry friction is the same in all
+        runs; None before the search ends.
+    varying : the covariance (size, size) that the variation of dry friction adds.
     nuisance : the nuisance parameters of each run, in the order of the runs.
     cost : sum of squares of residuals in units of the noise, with prior terms.
     chi_square : the cost without prior terms.
@@ -105,6 +107,7 @@ class GapFit(GapModel):
     run_points: Array
     spread: Array
     covariance: Array | None = field(default=None)
+    varying: Array | float = field(default=0.0)
 
     @property
     def chi(self) -> float:
@@ -584,9 +587,9 @@ _HIDDEN = 1e-9  # share of the strongest direction; weaker ones count as unknown
 def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> GapFit:
     """Return the fit with the covariance of its parameters, or without it if the model diverges.
 
-    The standard errors include the variation of dry friction from run to run, as the fit learnt it.
-    If the fit used the same friction for all runs, the variation is estimated from the residuals
-    (R. DerSimonian, N. Laird, Controlled Clinical Trials 7 (1986), 177-188).
+    The variation of dry friction from run to run is added as the fit learnt it. If the fit used the
+    same friction for all runs, the variation is estimated from the residuals (R. DerSimonian, N.
+    Laird, Controlled Clinical Trials 7 (1986), 177-188).
     """
 
     def weigh(job: tuple[int, tuple[GapRun, Nuisance]]) -> _Weighed:
@@ -613,7 +616,7 @@ def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> Gap
     # The encoders cause no error in a direction that no run determines; its variance is that of
     # H⁻¹.
     np.fill_diagonal(cov, np.maximum(np.diag(cov), least))
-    return replace(fit, covariance=cov + _varying_friction(fit, weighed))
+    return replace(fit, covariance=cov, varying=_varying_friction(fit, weighed))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

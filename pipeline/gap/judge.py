@@ -446,7 +446,7 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
 
     An effect may also be replaced by a simpler law. An effect within three standard errors of zero
     is dropped too. Of the few least certain effects, the least needed goes first. Losses add up, so
-    each hypothesis is compared with the best so far.
+    each hypothesis is compared with the best so far, and with the one from which it drops an effect.
     """
     best = chosen
     while chosen.key:
@@ -467,7 +467,8 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
                     without = _without(chosen, effects[index], study)
                     found.append(without)
                 nothing = sure[index] < SURE  # may be zero, so it must go
-                if nothing or (without.is_credible and _as_good(without, best, study)):
+                as_good = all(_as_good(without, one, study) for one in (chosen, best))
+                if nothing or (without.is_credible and as_good):
                     needless.append(without)
             if needless:
                 chosen = min(needless, key=lambda h: h.bic)

@@ -131,7 +131,8 @@ def list_effects(
     weight = {key: float(np.exp(-0.5 * (h.bic_of_all - lowest))) for key, h in same_size.items()}
     total, std = sum(weight.values()), None
     if final.covariance is not None:
-        std = np.sqrt(np.diag(final.covariance)) * structure.physical_derivative(final.theta)
+        variance = np.diag(final.covariance + final.varying)
+        std = np.sqrt(variance) * structure.physical_derivative(final.theta)
     places = [candidate.key for candidate in structure.effects]
     out = []
     for before, after in pairwise(path):
@@ -322,11 +323,15 @@ def repeatability(runs: Sequence[GapRun]) -> float | None:
             inside = (t >= b.t[0]) & (t <= b.t[-1])
             if not _same_input(a, b, a.t[inside], t[inside]):
                 continue
-            difference = [
-                x[inside] - np.interp(t[inside], b.t, y) for x, y in zip(a.y, b.y, strict=True)
-            ]
-            # Encoders are zeroed before every run, so a constant difference does not count.
-            squares += sum(float(((d - d.mean()) ** 2).sum()) for d in difference) / 2.0
+            other = np.array([np.interp(t[inside], b.t, y) for y in b.y])
+            difference, motion = a.y[:, inside] - other, np.gradient(other, a.t[inside], axis=1)
+            # Encoders are zeroed before every run, so a constant difference does not count. Neither
+            # does a delay of up to a sample, because an edge may be logged one sample late.
+            difference = difference - difference.mean(axis=1, keepdims=True)
+            most = a.record.sample_time
+            late = float((difference * motion).sum() / max((motion**2).sum(), 1e-300))
+            difference -= np.clip(late, -most, most) * motion
+            squares += float((difference**2).sum()) / 2.0
             sizes += float((a.swing**2).sum()) * np.count_nonzero(inside)
     return float(np.sqrt(squares / sizes)) if sizes else None
 
