@@ -605,6 +605,35 @@ CheckKind = Literal[
     "feedback",
 ]
 
+
+@result()
+class ReportStatus:
+    """How far the numbers of a report may be used; every page, terminal and exit code shows this.
+
+    Attributes
+    ----------
+    state : "no_model", or else "checks_failed", or else "numbers_disagree", or else "fine".
+    count : number of failed checks, or of the students' numbers that disagree with their data.
+    """
+
+    state: Literal["no_model", "checks_failed", "numbers_disagree", "fine"] = written()
+    count: int = written("failed checks, or numbers that disagree", default=0)
+
+    @property
+    def words(self) -> str:
+        """The status in a few words."""
+        match self.state:
+            case "no_model":
+                return "no model"
+            case "checks_failed":
+                return f"{self.count} check{'s' if self.count != 1 else ''} failed"
+            case "numbers_disagree" if self.count == 1:
+                return "1 of your numbers disagrees"
+            case "numbers_disagree":
+                return f"{self.count} of your numbers disagree"
+        return "fine"
+
+
 # Kinds of check of the set-up, the most serious first (see docs/decisions.md). Of the vanishing
 # parameters, only springs count.
 _CAUSES: tuple[CheckKind, ...] = (
@@ -990,6 +1019,7 @@ class Analysis:
         carts do not explain.
     discussion : `notes.md`, without its comments.
     reported : the students' own numbers, initial and final, with the digits as typed.
+    reported_off : the parameters for which one of these disagrees with the data.
     """
 
     schema: Literal["cartlab-results/1"] = written(default_factory=lambda: "cartlab-results/1")
@@ -1062,6 +1092,20 @@ class Analysis:
     late_channels: tuple[Finding, ...] = ()
     groups: tuple[RecordingGroup, ...] = ()
     reported: Mapping[str, Mapping[str, Decimal]] = field(default_factory=dict)
+    reported_off: tuple[str, ...] = ()
+
+    @computed()
+    def status(self) -> ReportStatus:
+        """How far the numbers may be used."""
+        if self.chain is None:
+            return ReportStatus(state="no_model")
+        for state, found in (
+            ("checks_failed", self.failed_checks),
+            ("numbers_disagree", self.reported_off),
+        ):
+            if found:
+                return ReportStatus(state=state, count=len(found))
+        return ReportStatus(state="fine")
 
     @computed()
     def provenance(self) -> Provenance:

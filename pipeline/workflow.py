@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 
 from pipeline.errors import DataError
+from pipeline.estimation.estimates import list_off
 from pipeline.estimation.force_balance import find_interventions
 from pipeline.estimation.hardware_check import check_hardware
 from pipeline.estimation.state_feedback import design_feedback
@@ -127,6 +128,7 @@ def analyse(
         groups=groups,
         late_channels=late,
         reported=submission.typed,
+        reported_off=list_off(rows, submission.typed),
         assumptions=list_assumptions(submission, data=data, fit=found.fit, checks=checks),
     )
     return _with_loops(analysis, submission, design=design, progress=progress, log=log)

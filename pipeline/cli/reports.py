@@ -165,7 +165,7 @@ def report(
         from pipeline.json_files import json_text
 
         typer.echo(json_text(analysis), nl=False)
-    if analysis.failed_checks:
+    if analysis.status.state != "fine":
         raise typer.Exit(1)
 
 
@@ -203,6 +203,7 @@ def run_report(
     say(_wrote(out, "report", pdf=files.pdf))
     if files.plots:
         say(f"wrote {out / 'compare.html'}")
+    say(f"status: {analysis.status.words}")
     return analysis
 
 

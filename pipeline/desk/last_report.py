@@ -21,6 +21,7 @@ FINDINGS = "questions.json"
 NOTES = "notes.md"
 NO_FINDINGS: Mapping[str, Any] = {
     "questions": [], "assumed": [], "contradicted": [], "failed": [], "changes": "", "turned": {},
+    "status": {"state": "", "words": ""},
 }  # fmt: skip
 PLOTS = "report/compare.html"
 PLOTS_OF = "report/plots.json"  # state of the sources of the plots
@@ -92,6 +93,7 @@ def read_findings(folder: Path) -> dict[str, Any]:
             "assumed": _pick_assumptions(read.get("assumed", [])),
             "contradicted": _pick_assumptions(read.get("contradicted", [])),
             "failed": [str(one) for one in read["failed"]],
+            "status": _pick_texts([read.get("status", {})], ("state", "words"))[0],
             "changes": str(read["changes"]),
             "turned": {str(run): int(sign) for run, sign in read.get("turned", {}).items()},
         }
@@ -139,6 +141,7 @@ def write_findings(
         "contradicted": [describe(one) for one in assumptions if one.support == "contradicted"],
         "changes": with_symbols(changes_line(changes)) if changes else "",
         "failed": [with_symbols(check.message) for check in analysis.failed_checks],
+        "status": {"state": analysis.status.state, "words": analysis.status.words},
         "turned": {
             one.id: 1 if one.input_scale > 0 else -1
             for one in analysis.records

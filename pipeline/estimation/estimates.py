@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from decimal import Decimal
 
 import numpy as np
 
@@ -162,6 +163,34 @@ def undetermined_reason(name: str, final: results.Estimate) -> str:
 def change_limit(name: str) -> float:
     """Return how far initial and final estimates may differ, in percent."""
     return DAMPING_LIMIT if read_name(name).is_damping else GAIN_AND_FREQUENCY_LIMIT
+
+
+def is_off(name: str, typed: Decimal, found: results.Estimate | None) -> bool:
+    """Return whether a number that students typed disagrees with the estimate from their data."""
+    if found is None or not found.value or found.source == "assumed":
+        return False
+    rounding = 0.5 * 10.0 ** int(typed.as_tuple().exponent)
+    # Other methods may give results that differ by this much: a third of the limit between initial
+    # and final estimates.
+    few = change_limit(name) / 3 / 100 * abs(found.value)
+    return abs(float(typed) - found.value) > rounding + SIGMA_LIMIT * (found.std or 0.0) + few
+
+
+def list_off(
+    rows: Sequence[results.ParameterRow], typed: Mapping[str, Mapping[str, Decimal]]
+) -> tuple[str, ...]:
+    """Return the parameters for which a typed number disagrees with the data.
+
+    `typed` has the initial and the final numbers by parameter.
+    """
+    return tuple(
+        row.name
+        for row in rows
+        if any(
+            row.name in numbers and is_off(row.name, numbers[row.name], getattr(row, column))
+            for column, numbers in typed.items()
+        )
+    )
 
 
 def _combined_sigmas(before: results.Estimate, after: results.Estimate) -> float | None:

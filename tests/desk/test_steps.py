@@ -12,6 +12,7 @@ DOUBT = DONE | {"to_look_at": 1}
 
 ASKED = DONE | {"report": "current", "questions": 3}
 OPEN = {"unanswered": 1}
+WRONG = {"trust": "checks_failed", "trust_words": "2 checks failed"}
 
 
 @pytest.mark.parametrize(
@@ -24,14 +25,17 @@ OPEN = {"unanswered": 1}
         (DONE, "done done needs none none", "report"),
         (DONE | {"making": True}, "done done none none none", "report"),
         (DONE | {"report": "older"}, "done done old done none", "report"),
-        (DOUBT | {"report": "current"}, "needs done done done needs", "hand-in"),
+        (DOUBT | {"report": "current"}, "doubt done done done needs", "hand-in"),
         (
             DOUBT | {"report": "answered", "unanswered": 1},
-            "needs done done needs none",
+            "doubt done done needs none",
             "questions",
         ),
         (DOUBT | {"report": "older"}, "needs done old done none", "files"),
-        (DOUBT | {"check": ("done", "all agree")}, "needs done done needs", "hand-in"),
+        (DOUBT | {"check": ("done", "all agree")}, "doubt done done needs", "hand-in"),
+        (ASKED | WRONG, "done done doubt done needs", "hand-in"),
+        (ASKED | WRONG | {"report": "answered"}, "done done doubt done needs", "hand-in"),
+        (ASKED | WRONG | {"report": "older"}, "done done old done none", "report"),
         (ASKED | OPEN, "done done done needs none", "questions"),
         (ASKED, "done done done done needs", "hand-in"),
         (DONE | {"check": ("needs", "some disagree")}, "done done needs none", "check"),

@@ -23,7 +23,8 @@ from pipeline.processes import Failed
 from pipeline.submission.edit import text_digest
 from pipeline.submission.load import NAME
 
-State = Literal["done", "needs", "old", "none"]  # as the page shows them; "none" means not yet
+# As the page shows them. "doubt" means done, but look at it; "none" means not yet.
+State = Literal["done", "doubt", "needs", "old", "none"]
 Status = tuple[State, str]  # a state, and the word shown for it
 
 
@@ -37,6 +38,7 @@ class StepFacts:
     missing : groups of the set-up in which something is missing.
     is_valid : whether `submission.toml` exists and is valid.
     report : state of the report: "none", "current", "answered" or "older"; see `find_state`.
+    trust, trust_words : status of the last report, in a key and in words; see `ReportStatus`.
     questions, unanswered : numbers of questions in the last report.
     handed : whether the zip was downloaded in its current state.
     check : state of the check; None in a lab that has a report instead.
@@ -47,11 +49,18 @@ class StepFacts:
     missing: tuple[str, ...] = ()
     is_valid: bool = False
     report: str = "none"
+    trust: str = "fine"
+    trust_words: str = ""
     making: bool = False
     questions: int = 0
     unanswered: int = 0
     handed: bool = False
     check: Status | None = None
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the report of the current files says that its numbers may be wrong."""
+        return self.report in ("current", "answered") and self.trust not in ("", "fine")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,10 +80,16 @@ class Step:
     word: str
 
 
+_OVER = ("done", "doubt")  # states after which the next step may begin
+
+
 def _files(facts: StepFacts) -> Status:
     if not facts.recordings:
         return "needs", "drop them"
-    return ("needs", f"{facts.to_look_at} to look at") if facts.to_look_at else ("done", "done")
+    if not facts.to_look_at:
+        return "done", "done"
+    # Once there is a result, doubts no longer block the next steps.
+    return ("doubt" if _has_result(facts) else "needs"), f"{facts.to_look_at} to look at"
 
 
 def _set_up(facts: StepFacts) -> Status:
@@ -86,6 +101,8 @@ def _set_up(facts: StepFacts) -> Status:
 def _report(facts: StepFacts) -> Status:
     if facts.making:
         return "none", "being made"
+    if facts.is_doubtful:
+        return "doubt", facts.trust_words
     if facts.report == "current":
         return "done", "done"
     if facts.report == "answered":
@@ -109,16 +126,15 @@ def _check(facts: StepFacts) -> Status:
 
 
 def _has_result(facts: StepFacts) -> bool:
-    """Return whether the current files have a report, or a check in which all numbers agree.
-
-    If so, doubts no longer block the next steps.
-    """
-    return (_check if facts.check else _report)(facts)[0] == "done"
+    """Return whether the current files have a report, or a check in which all numbers agree."""
+    if facts.check:
+        return _check(facts)[0] == "done"
+    return not facts.making and facts.report in ("current", "answered")
 
 
 def _hand_in(facts: StepFacts) -> Status:
     steps = (_set_up,) if facts.check else (_set_up, _questions)
-    if not _has_result(facts) or any(find(facts)[0] != "done" for find in steps):
+    if not _has_result(facts) or any(find(facts)[0] not in _OVER for find in steps):
         return "none", "not yet"
     return ("done", "downloaded") if facts.handed else ("needs", "ready")
 
@@ -149,14 +165,8 @@ def find_steps(facts: StepFacts) -> tuple[Step, ...]:
 
 
 def next_step(steps: Sequence[Step]) -> Step:
-    """Return the first step that is not done, or the last step.
-
-    Files that a person must look at are skipped once there is a report, or a check in which all
-    numbers agree.
-    """
-    has_result = any(s.state == "done" for s in steps if s.key in ("report", "check"))
-    open_ = [s for s in steps if s.state != "done" and not (has_result and s.key == "files")]
-    return open_[0] if open_ else steps[-1]
+    """Return the first step that is not done, or the last step."""
+    return next((step for step in steps if step.state not in _OVER), steps[-1])
 
 
 # -------------------------------------------------------------------------------- the view
@@ -285,6 +295,8 @@ def read_room(
             missing=tuple(group.title for group in groups if group.missing),
             is_valid=bool(text) and fault is None,
             report=report,
+            trust=findings["status"]["state"],
+            trust_words=findings["status"]["words"],
             making=bool(job and not job.over and job.task[0] == "make_report"),
             questions=len(findings["questions"]),
             unanswered=len(found["unanswered"]),

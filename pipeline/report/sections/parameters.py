@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
 
-from pipeline.estimation.estimates import SIGMA_LIMIT, change_limit
+from pipeline.estimation.estimates import change_limit, is_off
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.report.builder import Page
@@ -161,33 +161,12 @@ def _error_cells(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cel
     if found is None or not found.value or found.source == "assumed":
         return cell(NOTHING, "quiet"), cell("")
     share = percent(100 * (float(yours) - found.value) / abs(found.value), signed=True)
-    if not _is_off(name, yours, found):
+    if not is_off(name, yours, found):
         return cell(share), cell("")
     read = read_name(name)
     kinds = {"gain": read.is_gain, "damping": read.is_ratio, "frequency": read.is_frequency}
     look = next((_WORDS.text(f"look_{kind}") for kind, is_it in kinds.items() if is_it), "")
     return cell(share, "bad"), cell(look)
-
-
-def _is_off(name: str, yours: Decimal, found: Estimate | None) -> bool:
-    if found is None or not found.value or found.source == "assumed":
-        return False
-    rounding = 0.5 * 10.0 ** int(yours.as_tuple().exponent)
-    # Other methods may give results that differ by this much: a third of the limit between initial
-    # and final estimates.
-    few = change_limit(name) / 3 / 100 * abs(found.value)
-    return abs(float(yours) - found.value) > rounding + SIGMA_LIMIT * (found.std or 0.0) + few
-
-
-def reported_off(analysis: Analysis) -> list[str]:
-    """Return the parameters for which the students' numbers disagree with their data."""
-    return [
-        row.name
-        for row in analysis.rows
-        for column, claimed in analysis.reported.items()
-        if (yours := claimed.get(row.name)) is not None
-        and _is_off(row.name, yours, getattr(row, column))
-    ]
 
 
 def _parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:

@@ -20,8 +20,7 @@ from pipeline.report.document import (
 from pipeline.report.sections.housekeeping import taken_text
 from pipeline.report.sections.loops import CLOSE
 from pipeline.report.sections.measurements import overview_blocks
-from pipeline.report.sections.parameters import reported_off
-from pipeline.results import Analysis, Check, HardwareCheck, ParameterRow, Stage
+from pipeline.results import Analysis, Check, HardwareCheck, ParameterRow, ReportStatus, Stage
 from pipeline.words.numbers import (
     NOTHING,
     count,
@@ -95,7 +94,11 @@ def summary(page: Page) -> list[Block]:
     analysis = page.analysis
     blocks: list[Block] = [_identified(analysis)]
     findings = _findings(analysis)
-    verdicts = [*_fit_tile(analysis), *(one.tile for one in findings if one.tile)]
+    verdicts = [
+        _status_tile(analysis.status),
+        *_fit_tile(analysis),
+        *(one.tile for one in findings if one.tile),
+    ]
     blocks += [Tiles(tiles) for tiles in (_numbers_board(analysis), tuple(verdicts)) if tiles]
     if problems := [one.text for one in findings if not one.good]:
         blocks.append(bullet_list(problems))
@@ -234,6 +237,14 @@ def _number_tile(row: ParameterRow, *, unit: str, is_sure: bool, error: str) -> 
 
 def _is_told(name: Name) -> bool:
     return name.is_gain or (name.is_frequency and name.is_mode)
+
+
+_PLACES = {"no_model": "#next", "checks_failed": "#checks"}  # sections that say more about a status
+
+
+def _status_tile(status: ReportStatus) -> Tile:
+    url = _PLACES.get(status.state, "#parameters")
+    return _tile("tile_status", status.words, "", good=status.state == "fine", url=url)
 
 
 def _fit_tile(analysis: Analysis) -> list[Tile]:
@@ -491,8 +502,8 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     asked = {_group(check) for check in analysis.failed_checks}
     if analysis.unread:
         yield say("next_unread", lines=rich(clean("; ".join(analysis.unread[:_MOST_TOLD]))))
-    if wrong := list(dict.fromkeys(reported_off(analysis))):
-        yield say("next_reported", names=names_spans(wrong))
+    if analysis.reported_off:
+        yield say("next_reported", names=names_spans(analysis.reported_off))
     if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
         yield say("next_short", runs=clean(listing(short)))
     doubted = {check.experiment for check in analysis.hardware if check.contradicted}
