@@ -446,7 +446,7 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
 
     An effect may also be replaced by a simpler law. An effect within three standard errors of zero
     is dropped too. Of the few least certain effects, the least needed goes first. Losses add up, so
-    each hypothesis is compared with the best so far, and with the one from which it drops an effect.
+    each hypothesis is compared with the best so far, and with the one that it is made from.
     """
     best = chosen
     while chosen.key:

@@ -258,10 +258,11 @@ def _begins_at_rest(y: Array, u: Array, still: Array, sample_time: float) -> tup
     pushed = in_place and (
         quiet * sample_time > _HELD_STILL or bool(np.any(np.abs(y[:, 0]) > still))
     )
-    if pushed:
-        return at_rest, False
-    # The carts rested if they have no velocity at the first sample. It was switched on there, but a
-    # log may be a sample late. So the start is fitted.
+    is_step = bool(np.all(u[:3] == u[0]))
+    if pushed or not is_step:
+        return at_rest, at_rest and not pushed
+    # The carts rested if they have no velocity at the first sample. The step began there, but a log
+    # may be a sample late. So the start is fitted.
     first, second = np.diff(y[:, :3], axis=1).T
     return False, bool(np.all(np.abs(1.5 * first - 0.5 * second) <= still))
 

@@ -74,7 +74,7 @@ def test_the_input_before_a_rest_is_what_balances_the_cart(y, u, before):
 
 
 def test_an_input_that_moves_the_cart_at_once_was_not_there_before():
-    """A cart that starts to move with the first sample was not pushed before."""
+    """A cart that starts to move with the first sample was not pushed before; its start is open."""
     record = steady(0.0, [2.0, 2.0, 2.0, 2.0])
     record = replace(record, y=(1.0 - np.cos(8.0 * record.t))[None])
 
@@ -82,7 +82,7 @@ def test_an_input_that_moves_the_cart_at_once_was_not_there_before():
 
     assert run.command[0] == 0.0
     assert run.knots[0] < run.t[0]
-    assert run.at_rest
+    assert not run.at_rest
 
 
 def test_a_part_of_a_record_keeps_the_earlier_input():
