@@ -1099,12 +1099,10 @@ class Analysis:
         """How far the numbers may be used."""
         if self.chain is None:
             return ReportStatus(state="no_model")
-        for state, found in (
-            ("checks_failed", self.failed_checks),
-            ("numbers_disagree", self.reported_off),
-        ):
-            if found:
-                return ReportStatus(state=state, count=len(found))
+        if self.failed_checks:
+            return ReportStatus(state="checks_failed", count=len(self.failed_checks))
+        if self.reported_off:
+            return ReportStatus(state="numbers_disagree", count=len(self.reported_off))
         return ReportStatus(state="fine")
 
     @computed()

@@ -24,6 +24,7 @@ GOOD = replace(
     make_analysis(1, repeats=1),
     checks=(Check(kind="step", run="a", outcome="pass", message="it settles"),),
 )
+assert GOOD.fit is not None
 BAD = Check(kind="step", run="b", outcome="fail", message="it does not settle")
 
 
@@ -57,6 +58,7 @@ def test_a_tile_shows_the_status(changes):
 def test_a_typed_number_is_off_beyond_its_rounding_and_the_error(share, off):
     """A number within a few percent is right; a frequency in another unit is off."""
     (row,) = (row for row in GOOD.rows if row.name == "omega_n")
+    assert row.final is not None
     typed = {"initial": {}, "final": {"omega_n": Decimal(f"{share * row.final.value:.4f}")}}
     assert list_off(GOOD.rows, typed) == (("omega_n",) if off else ())
 

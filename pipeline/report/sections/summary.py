@@ -503,7 +503,7 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     if analysis.unread:
         yield say("next_unread", lines=rich(clean("; ".join(analysis.unread[:_MOST_TOLD]))))
     if analysis.reported_off:
-        yield say("next_reported", names=names_spans(analysis.reported_off))
+        yield say("next_reported", names=names_spans([*analysis.reported_off]))
     if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
         yield say("next_short", runs=clean(listing(short)))
     doubted = {check.experiment for check in analysis.hardware if check.contradicted}
