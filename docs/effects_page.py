@@ -9,7 +9,7 @@ from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import Effect
 from pipeline.report.builder import PageBuilder
-from pipeline.report.effect_texts import deciding_experiment, parameter_text
+from pipeline.report.effect_texts import parameter_text
 from pipeline.report.effects import BENCH, effect_picture, hiding_option
 from pipeline.report.figures.style import drawing
 from pipeline.simulated.hidden import usual_term
@@ -58,7 +58,7 @@ def _entry(effect: Effect) -> Iterator[str]:
         "Parameters": parameters,
         "Option": f"`{hiding_option(term)}`",
         "Fingerprint": effect.fingerprint,
-        "Deciding experiment": deciding_experiment(effect),
+        "Deciding experiment": effect.deciding_run,
         "Easily mistaken for": effect.equivalent,
         "Read": effect.reference,
     }

@@ -620,6 +620,11 @@ class ReportStatus:
     count: int = written("failed checks, or numbers that disagree", default=0)
 
     @property
+    def is_fine(self) -> bool:
+        """Whether nothing speaks against the numbers."""
+        return self.state == "fine"
+
+    @property
     def words(self) -> str:
         """The status in a few words."""
         match self.state:

@@ -165,7 +165,7 @@ def report(
         from pipeline.json_files import json_text
 
         typer.echo(json_text(analysis), nl=False)
-    if analysis.status.state != "fine":
+    if not analysis.status.is_fine:
         raise typer.Exit(1)
 
 

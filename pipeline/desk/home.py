@@ -10,7 +10,7 @@ from starlette.responses import RedirectResponse, Response
 from pipeline.desk.browse import MOST, FolderList, list_folders
 from pipeline.desk.form_input import read_path
 from pipeline.desk.jobs import Job
-from pipeline.desk.last_report import NO_FINDINGS, find_state, read_findings
+from pipeline.desk.last_report import find_state, read_findings
 from pipeline.desk.navigation import NavLink, list_feedback
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.users import Place, User, name_place
@@ -184,16 +184,16 @@ def _describe_submission(ask: PageRequest, n: int, folder: Path) -> OpenSubmissi
         # A link is not followed, because it may lead to a whole disk.
         files = 0 if data.is_symlink() else sum(1 for path in data.rglob("*") if path.is_file())
         report = find_state(folder) if folder.is_dir() else "unreadable"
-        trust = read_findings(folder)["status"]
+        status = read_findings(folder)["status"]
     except OSError:  # the desk may not read it, or its disk is not connected
-        files, report, trust = 0, "unreadable", NO_FINDINGS["status"]
+        files, report, status = 0, "unreadable", None
     return OpenSubmission(
         n=n,
         name=name_place(folder),
         folder=folder,
         files=files,
         report=report,
-        doubt="" if trust["state"] in ("", "fine") else trust["words"],
+        doubt="" if status is None or status.is_fine else status.words,
         is_recording=session is not None and not session.ended.is_set(),
         has_plan=file_problem(folder, PLAN) is None,
         has_solution=file_problem(folder, "solution/solution.html") is None,

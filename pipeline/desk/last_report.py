@@ -7,8 +7,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import TypeAdapter
+
 from pipeline.errors import SubmissionError
 from pipeline.output import write_file
+from pipeline.results import ReportStatus
 from pipeline.submission.load import MAX_NOTES_BYTES, NAME, file_problem, list_experiments
 from pipeline.submission.toml import find_deep_key, read_text
 
@@ -21,7 +24,7 @@ FINDINGS = "questions.json"
 NOTES = "notes.md"
 NO_FINDINGS: Mapping[str, Any] = {
     "questions": [], "assumed": [], "contradicted": [], "failed": [], "changes": "", "turned": {},
-    "status": {"state": "", "words": ""},
+    "status": None,
 }  # fmt: skip
 PLOTS = "report/compare.html"
 PLOTS_OF = "report/plots.json"  # state of the sources of the plots
@@ -93,7 +96,7 @@ def read_findings(folder: Path) -> dict[str, Any]:
             "assumed": _pick_assumptions(read.get("assumed", [])),
             "contradicted": _pick_assumptions(read.get("contradicted", [])),
             "failed": [str(one) for one in read["failed"]],
-            "status": _pick_texts([read.get("status", {})], ("state", "words"))[0],
+            "status": _pick_status(read.get("status")),
             "changes": str(read["changes"]),
             "turned": {str(run): int(sign) for run, sign in read.get("turned", {}).items()},
         }
@@ -141,7 +144,7 @@ def write_findings(
         "contradicted": [describe(one) for one in assumptions if one.support == "contradicted"],
         "changes": with_symbols(changes_line(changes)) if changes else "",
         "failed": [with_symbols(check.message) for check in analysis.failed_checks],
-        "status": {"state": analysis.status.state, "words": analysis.status.words},
+        "status": {"state": analysis.status.state, "count": analysis.status.count},
         "turned": {
             one.id: 1 if one.input_scale > 0 else -1
             for one in analysis.records
@@ -152,6 +155,11 @@ def write_findings(
     }
     write_file(out / FINDINGS, json.dumps(findings, ensure_ascii=False))
     return findings
+
+
+def _pick_status(found: object) -> ReportStatus | None:
+    """Return the status of the report; None in a file of an earlier version."""
+    return None if found is None else TypeAdapter(ReportStatus).validate_python(found)
 
 
 def _pick_assumptions(found: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:

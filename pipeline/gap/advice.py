@@ -27,7 +27,7 @@ from pipeline.gap.types import (
     Trace,
     Verdict,
 )
-from pipeline.plant.effect import AugmentedChain, DecidingRun, Effect
+from pipeline.plant.effect import AugmentedChain, Effect, Motions
 from pipeline.words.numbers import join_names, listing, significant
 from pipeline.words.phrases import phrases
 from pipeline.words.text import capital
@@ -42,7 +42,7 @@ _SHARP = 0.05  # a smaller relative standard error needs no further recording
 _EDGE, _FLAT = 0.2, 0.01  # changes of the input from sample to sample, as shares of its range
 
 # The recordings that show an effect or a misfit, the most telling first.
-_OPTIONS: Mapping[DecidingRun, tuple[Option, ...]] = {
+_OPTIONS: Mapping[Motions, tuple[Option, ...]] = {
     "small motions": (("decay", "smaller"), ("step", "smaller")),
     "large motions": (("decay", "larger"), ("step", "larger")),
     "both sides": (("step", "both_signs"), ("step", "larger")),
@@ -113,11 +113,6 @@ def side_names(sides: Sides, *, most: int | None = None) -> tuple[str, str]:
     one, other = ([effect.name for effect in side] for side in sides)
     less = _WORDS.text("without_it" if len(one) == 1 else "without_them")
     return f"with {listing(one, most=most)}", f"with {listing(other, most=most)}" if other else less
-
-
-def deciding_run(effect: Effect) -> str:
-    """Return the kind of recording that confirms an effect or rules it out, as a noun phrase."""
-    return phrases("effects").text(f"in_{effect.deciding_run.replace(' ', '_')}")
 
 
 def proposed_recording(recording: Recording, *, drive: str) -> str:
@@ -233,14 +228,14 @@ def _differ_in(sides: Sides) -> DifferIn | None:
         return "place"
     if _is_driven(one) != _is_driven(other):
         return "drive"
-    if one.deciding_run != other.deciding_run:
+    if one.shown_by != other.shown_by:
         return "motion"
     return "quantity" if one.axis != other.axis else None
 
 
 def _is_driven(effect: Effect) -> bool:
     """Return whether an effect changes nothing in free motion."""
-    return effect.needs_input or effect.deciding_run == "driven motions"
+    return effect.needs_input or effect.shown_by == "driven motions"
 
 
 # ---------------------------------------------------------------- the recordings that are there
@@ -312,8 +307,8 @@ class _Recordings:
     def showing(self, found: EffectAt) -> list[Wanted]:
         """Return the recordings that show an effect, the most telling first."""
         effect = found.effect
-        options = _OPTIONS[effect.deciding_run]
-        if effect.needs_input and effect.deciding_run != "driven motions":
+        options = _OPTIONS[effect.shown_by]
+        if effect.needs_input and effect.shown_by != "driven motions":
             options = tuple(option for option in options if option[0] != "decay")
         return _wanted(options, self.cart_of(found))
 
@@ -381,7 +376,7 @@ def _in_words(advice: Advice, gap: Gap) -> str:
             said.append(_WORDS.text(key, Name=capital(found.name)))
     elif advice.difference is None and (advice.aim == "check" or advice.differ_in == "motion"):
         said += [
-            _WORDS.text("shows_most", Name=capital(found.name), run=deciding_run(found.effect))
+            _WORDS.text("shows_most", Name=capital(found.name), run=_motions(found.effect))
             for found in effects
         ]
     one, other = side_names(advice.between) if len(advice.between) == 2 else ("", "")
@@ -410,3 +405,8 @@ def _in_words(advice: Advice, gap: Gap) -> str:
     if advice.repeat:
         said.append(_WORDS.text("repeat_runs"))
     return " ".join(said)
+
+
+def _motions(effect: Effect) -> str:
+    """Return the kind of motions that show an effect best, as a noun phrase."""
+    return phrases("effects").text(f"in_{effect.shown_by.replace(' ', '_')}")

@@ -37,7 +37,9 @@ COULOMB_FRICTION = Effect(
     parameters=(FORCE,),
     fingerprint="The peaks of a decay fall along a straight line, not an exponential. The cart "
     "stops abruptly, not always at the same position.",
-    deciding_run="small motions",
+    deciding_run="Free decays from two release distances: the fitted ζ is smaller for the larger "
+    "swings.",
+    shown_by="small motions",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="velocity",
     family="dry friction",
@@ -64,7 +66,9 @@ STICTION = Effect(
         EffectParameter("velocity", "w", "position/s", scale="velocity", typical=0.1),
     ),
     fingerprint="The cart sticks at its turning points and breaks loose with a jerk.",
-    deciding_run="slow motions",
+    deciding_run="A slow ramp of the input: the cart needs more force to break loose than to keep "
+    "moving.",
+    shown_by="slow motions",
     reference="B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994)",
     axis="velocity",
     family="dry friction",
@@ -85,7 +89,8 @@ PRESLIDING_FRICTION = Effect(
     ),
     fingerprint="The half periods become shorter as the amplitude falls. The cart ends with small, "
     "fast oscillations about its rest position.",
-    deciding_run="small motions",
+    deciding_run="Small free decays: the frequency rises as the amplitude falls below δ.",
+    shown_by="small motions",
     reference="P. R. Dahl, AIAA Journal 14 (1976), 1675-1682",
     axis="velocity",
     family="dry friction",
@@ -101,7 +106,8 @@ LOAD_FRICTION = Effect(
     law=FrictionLaw("μ * abs(u)"),
     parameters=(EffectParameter("coefficient", "μ", "", scale="1", typical=0.03, neutral=0.0),),
     fingerprint="While the motor pushes, there is more dry friction than in a free decay.",
-    deciding_run="driven motions",
+    deciding_run="Steps of two sizes: doubling the input doubles the added friction.",
+    shown_by="driven motions",
     reference="B. Armstrong-Hélouvry, Control of Machines with Friction, chapter 2",
     axis="velocity",
 )
@@ -124,7 +130,9 @@ QUADRATIC_DRAG = Effect(
         ),
     ),
     fingerprint="Large swings decay faster than small ones.",
-    deciding_run="large motions",
+    deciding_run="Free decays from two release distances: the fitted ζ is larger for the larger "
+    "swings.",
+    shown_by="large motions",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="velocity",
 )
@@ -148,7 +156,9 @@ FORCE_OFFSET = Effect(
         ),
     ),
     fingerprint="In every run the cart rests off zero, as if pushed by the same force.",
-    deciding_run="held carts",
+    deciding_run="Runs with different carts held: the stiffer the springs on the cart, the less a "
+    "force displaces it. A wrong encoder zero shifts the reading equally in all runs.",
+    shown_by="held carts",
     reference="the balance of forces in the chain at rest",
     axis="position",
     only_rest=True,
@@ -175,7 +185,8 @@ CUBIC_SPRING = Effect(
     ),
     fingerprint="The frequency depends on the amplitude, and the static gain depends on the size "
     "of the step.",
-    deciding_run="large motions",
+    deciding_run="A free decay from a large distance: the first period differs from the last.",
+    shown_by="large motions",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="stretch",
     equivalent="The same effect in the other wall spring, if there is only one cart.",
@@ -202,7 +213,8 @@ ASYMMETRIC_SPRING = Effect(
     ),
     fingerprint="The swings are longer to one side than to the other, and the centre of a large "
     "oscillation is off the rest position.",
-    deciding_run="both sides",
+    deciding_run="Steps of the same size in both directions: the settled positions differ.",
+    shown_by="both sides",
     reference="A. H. Nayfeh, D. T. Mook, Nonlinear Oscillations, section 2.3",
     axis="stretch",
     equivalent="The same effect with the opposite sign in the other wall spring, if there is only "
@@ -231,7 +243,9 @@ SLACK_SPRING = Effect(
         EffectParameter("stretch", "s", "position", scale="position", typical=0.35, side=True),
     ),
     fingerprint="The swings change shape beyond some position, on one side only.",
-    deciding_run="both sides",
+    deciding_run="Steps of both signs and several sizes: plotted over the input, the settled "
+    "position is a line with a corner.",
+    shown_by="both sides",
     reference="S. W. Shaw, P. J. Holmes, Journal of Sound and Vibration 90 (1983), 129-155",
     axis="stretch",
     equivalent="The same effect in the other wall spring at the opposite stretch, if there is "
@@ -251,7 +265,8 @@ COUPLING_DAMPER = Effect(
         ),
     ),
     fingerprint="Modes in which the carts move against each other are damped more than the others.",
-    deciding_run="held carts",
+    deciding_run="A free decay of each mode: compare their damping.",
+    shown_by="held carts",
     reference="L. Meirovitch, Fundamentals of Vibrations, chapter 7",
     axis="velocity",
     between_carts=True,
@@ -277,7 +292,9 @@ DRIVE_DAMPING = Effect(
         ),
     ),
     fingerprint="The cart is damped more after the input steps on than after it steps off.",
-    deciding_run="driven motions",
+    deciding_run="Steps of two sizes and a free decay: compared with the decay, both steps add the "
+    "same damping.",
+    shown_by="driven motions",
     reference="back-EMF of a voltage-driven DC motor; any text on electric drives",
     axis="velocity",
 )
@@ -291,7 +308,9 @@ DEAD_ZONE = Effect(
     law=InputLaw("sign(u) * max(abs(u) - w, 0)"),
     parameters=(EffectParameter("width", "w", "input", scale="input", typical=0.08, neutral=0.0),),
     fingerprint="Small inputs move the cart too little: the static gain grows with the step.",
-    deciding_run="small motions",
+    deciding_run="Steps of three sizes: plotted over the input, the settled position is a line "
+    "that misses the origin.",
+    shown_by="small motions",
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 10.5",
     axis="input",
 )
@@ -305,7 +324,8 @@ SATURATION = Effect(
     law=InputLaw("clip(u, -L, L)"),
     parameters=(EffectParameter("limit", "L", "input", scale="input", typical=0.65),),
     fingerprint="Large inputs move the cart too little: the static gain falls as the step grows.",
-    deciding_run="large motions",
+    deciding_run="Steps of three sizes: above the limit, a larger input moves the cart no further.",
+    shown_by="large motions",
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 10.5",
     axis="input",
 )
@@ -324,7 +344,8 @@ INPUT_DELAY = Effect(
     ),
     fingerprint="Every driven motion starts late by the same time. Free decays fit the linear "
     "model.",
-    deciding_run="edges",
+    deciding_run="A step at a high sample rate: the cart starts to move some time after the edge.",
+    shown_by="edges",
     reference="K. J. Åström, B. Wittenmark, Computer-Controlled Systems, section 2.3",
     axis="time",
     equivalent="A first-order lag whose time constant is much shorter than a sample.",
@@ -344,7 +365,9 @@ ACTUATOR_LAG = Effect(
     ),
     fingerprint="The cart responds to an edge of the input gradually. At high frequencies it "
     "moves less, and later.",
-    deciding_run="sweeps",
+    deciding_run="A sweep beyond the resonances: a lag lowers the amplitude there, but a delay "
+    "does not.",
+    shown_by="sweeps",
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 3.2",
     axis="frequency",
     equivalent="A delay, if the time constant is much shorter than a sample.",
@@ -412,7 +435,9 @@ BACKLASH = Effect(
         ),
     ),
     fingerprint="At each reversal of the force there is a short pause, then a knock.",
-    deciding_run="about zero",
+    deciding_run="Small steps about zero, and the same steps on top of a constant input. Only the "
+    "steps about zero cross the gap, so only they start late.",
+    shown_by="about zero",
     reference="M. Nordin, P.-O. Gutman, Automatica 38 (2002), 1633-1649",
     axis="time",
 )
@@ -444,7 +469,9 @@ COGGING = Effect(
     ),
     fingerprint="The cart tends to rest at evenly spaced positions. Plotted over position, the "
     "unexplained force is a sine wave, the same in both directions of travel.",
-    deciding_run="slow motions",
+    deciding_run="A slow ramp of the input, up and down: the cart jumps between rest positions "
+    "that are the same in both directions. With dry friction they differ.",
+    shown_by="slow motions",
     reference="D. C. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed., chapter 5",
     axis="position",
 )
@@ -488,7 +515,8 @@ END_STOP = Effect(
     ),
     fingerprint="The largest swings are cut off on one side, always at the same position, with a "
     "bounce.",
-    deciding_run="large motions",
+    deciding_run="The same step, a third smaller: the swings are no longer cut off.",
+    shown_by="large motions",
     reference="K. H. Hunt, F. R. E. Crossley, Journal of Applied Mechanics 42 (1975), 440-445",
     axis="position",
 )
@@ -503,7 +531,8 @@ SENSOR_GAIN = Effect(
     growth=FitCoordinates(("e",), {"g": "1 + e"}, signed=True),
     parameters=(EffectParameter("gain", "g", "", scale="1", typical=0.97, neutral=1.0),),
     fingerprint="No chain of springs can give the measured ratio between the carts' amplitudes.",
-    deciding_run="ruler",
+    deciding_run="Move each cart along a ruler and compare the distance with its encoder.",
+    shown_by="ruler",
     reference="the balance of forces in the chain at rest",
     axis="position",
     fewest_carts=2,
@@ -557,7 +586,9 @@ EXTRA_MODE = Effect(
     ),
     fingerprint="There is one more resonance than there are carts, or a resonance is split into "
     "two peaks.",
-    deciding_run="sweeps",
+    deciding_run="A sweep through the extra resonance, then the same sweep with the suspected part "
+    "held by hand.",
+    shown_by="sweeps",
     reference="J. P. Den Hartog, Mechanical Vibrations, section 3.2",
     axis="frequency",
 )

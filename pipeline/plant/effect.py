@@ -240,8 +240,8 @@ class _Formula:
 
 Place = Literal["cart", "spring", "input"]
 Axis = Literal["velocity", "position", "stretch", "input", "time", "frequency"]
-# The recordings that show an effect best; `templates/words/effects.toml` describes each kind.
-DecidingRun = Literal[
+# The motions that show an effect best; `templates/words/effects.toml` describes each kind.
+Motions = Literal[
     "small motions",
     "large motions",
     "both sides",
@@ -335,7 +335,8 @@ class Effect:
     growth : the coordinates in which a fit grows the effect from zero. None if the
         parameters serve as coordinates.
     fingerprint : how the effect shows in the data.
-    deciding_run : the kind of recording that confirms the effect or rules it out.
+    deciding_run : the experiment that confirms the effect or rules it out.
+    shown_by : the kind of motions that show the effect best.
     axis : the quantity on which the force (or reading) depends.
     between_carts : whether the effect exists only on springs between carts. On a spring to a wall
         it would be part of the linear chain.
@@ -360,7 +361,8 @@ class Effect:
     law: Law
     parameters: tuple[EffectParameter, ...]
     fingerprint: str
-    deciding_run: DecidingRun
+    deciding_run: str
+    shown_by: Motions
     reference: str
     axis: Axis
     growth: FitCoordinates | None = None

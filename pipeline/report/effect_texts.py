@@ -4,11 +4,9 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.gap.advice import deciding_run
 from pipeline.plant.effect import Effect, EffectParameter
 from pipeline.words.math import to_tex, to_text
 from pipeline.words.numbers import unit_text
-from pipeline.words.text import capital
 
 POSITION, INPUT = "cm", "V"  # units of the presets; other benches may have other units
 
@@ -48,17 +46,12 @@ def catalogue_data(effects: Sequence[Effect]) -> list[dict[str, Any]]:
                 for p in effect.parameters
             ],
             "fingerprint": effect.fingerprint,
-            "deciding_experiment": deciding_experiment(effect),
+            "deciding_experiment": effect.deciding_run,
             "reference": effect.reference,
             "equivalent": effect.equivalent or None,
         }
         for effect in effects
     ]
-
-
-def deciding_experiment(effect: Effect) -> str:
-    """Return the experiment that confirms an effect or rules it out, as a sentence."""
-    return f"{capital(deciding_run(effect))}."
 
 
 def parameter_text(parameter: EffectParameter) -> str:
@@ -76,7 +69,7 @@ def _entry(effect: Effect) -> str:
         ("parameters", ", ".join(parameter_text(p) for p in effect.parameters if p.reported)),
         ("contact details", ", ".join(details)),
         ("fingerprint", effect.fingerprint),
-        ("decided by", deciding_experiment(effect)),
+        ("decided by", effect.deciding_run),
         ("easily taken for", effect.equivalent),
         ("reference", effect.reference),
     ]

@@ -14,7 +14,7 @@ from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.effect import AugmentedChain, Effect, EffectTerm
 from pipeline.report.builder import PageBuilder, Part
 from pipeline.report.document import Block, Code, Document, Picture, bullet_list, paragraph
-from pipeline.report.effect_texts import INPUT, POSITION, deciding_experiment, parameter_text
+from pipeline.report.effect_texts import INPUT, POSITION, parameter_text
 from pipeline.report.equations.model import formula
 from pipeline.report.figures import MODEL, QUIET, SECOND, SECOND_LINE
 from pipeline.report.figures.style import legend_above, log_scale, panels, position_label
@@ -68,7 +68,7 @@ def _entry(page: PageBuilder, effect: Effect) -> list[Block]:
     term = usual_term(effect, chain)
     facts = {
         "fingerprint": effect.fingerprint,
-        "deciding": deciding_experiment(effect),
+        "deciding": effect.deciding_run,
         "equivalent": effect.equivalent,
         "read": f"{effect.reference}.",
     }

@@ -24,7 +24,6 @@ from pipeline.report.document import (
     cell,
     paragraph,
 )
-from pipeline.report.effect_texts import deciding_experiment
 from pipeline.report.equations.model import augmented_equations, in_order, law
 from pipeline.report.figures.gap import (
     band_shows,
@@ -205,7 +204,7 @@ def _effect(page: Page, gap: Gap, index: int, *, forces: Sequence[ResidualForce]
         blocks.append(rival_table(page, found, gap))
     facts = {
         "fingerprint": effect.fingerprint,
-        "decides": deciding_experiment(effect),
+        "decides": effect.deciding_run,
         "equivalent": effect.equivalent,
         "read": effect.reference,
     }

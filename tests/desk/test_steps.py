@@ -3,6 +3,7 @@
 import pytest
 
 from pipeline.desk.student.submission_view import StepFacts, find_steps, next_step
+from pipeline.results import ReportStatus
 
 DONE = {"recordings": 33, "is_valid": True}
 
@@ -12,7 +13,7 @@ DOUBT = DONE | {"to_look_at": 1}
 
 ASKED = DONE | {"report": "current", "questions": 3}
 OPEN = {"unanswered": 1}
-WRONG = {"trust": "checks_failed", "trust_words": "2 checks failed"}
+WRONG = {"status": ReportStatus(state="checks_failed", count=2)}
 
 
 @pytest.mark.parametrize(

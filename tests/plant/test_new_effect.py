@@ -23,7 +23,8 @@ CUBIC_DRAG = Effect(
     law=ForceLaw("-q * v**3"),
     parameters=(EffectParameter("coefficient", "q", "input s^3/position^3", scale="damping"),),
     fingerprint="Large swings die faster than small ones.",
-    deciding_run="large motions",
+    deciding_run="Free decay from two release heights.",
+    shown_by="large motions",
     reference="none: it stands here for any new law",
     axis="velocity",
 )

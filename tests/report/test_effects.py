@@ -6,7 +6,7 @@ import re
 import pytest
 
 from pipeline.plant.catalogue import CATALOGUE, find_effect
-from pipeline.report.effect_texts import catalogue_data, catalogue_text, deciding_experiment
+from pipeline.report.effect_texts import catalogue_data, catalogue_text
 from pipeline.report.effects import build_gallery, render_effects
 from tests.helpers.commandline import cartlab_here
 
@@ -16,7 +16,7 @@ def test_the_list_has_every_effect_with_its_parameters():
     text = " ".join(catalogue_text(CATALOGUE).split())
 
     for effect in CATALOGUE:
-        for part in (effect.key, effect.sentence, effect.fingerprint, deciding_experiment(effect)):
+        for part in (effect.key, effect.sentence, effect.fingerprint, effect.deciding_run):
             assert part in text
         assert effect.reference in text
         assert all(f"{p.name} {p.symbol}" in text for p in effect.parameters)

@@ -51,7 +51,7 @@ def test_a_tile_shows_the_status(changes):
     boards = [block for block in summary(Page(analysis)) if isinstance(block, Tiles)]
     tiles = {plain(tile.label): tile for board in boards for tile in board.tiles}
     assert plain(tiles["Status"].value) == analysis.status.words
-    assert tiles["Status"].tone == ("good" if analysis.status.state == "fine" else "bad")
+    assert tiles["Status"].tone == ("good" if analysis.status.is_fine else "bad")
 
 
 @pytest.mark.parametrize(("share", "off"), [(1.0, False), (1.01, False), (1.2, True), (6.28, True)])
@@ -77,7 +77,7 @@ def test_terminal_exit_code_files_and_desk_agree(tmp_path):
             capture_output=True, encoding="utf-8", check=False,
         )  # fmt: skip
         results = json.loads((folder / "report" / "results.json").read_text(encoding="utf-8"))
-        findings = read_findings(folder)["status"]
-        assert results["status"]["state"] == findings["state"] == state
+        status = read_findings(folder)["status"]
+        assert results["status"]["state"] == status.state == state
         assert done.returncode == (state != "fine")
-        assert done.stderr.splitlines()[-1] == f"status: {findings['words']}"
+        assert done.stderr.splitlines()[-1] == f"status: {status.words}"

@@ -20,6 +20,7 @@ from pipeline.desk.student.form import (
 from pipeline.desk.student.recording_rows import RecordingRow, list_rows
 from pipeline.desk.toml_form import Field
 from pipeline.processes import Failed
+from pipeline.results import ReportStatus
 from pipeline.submission.edit import text_digest
 from pipeline.submission.load import NAME
 
@@ -38,7 +39,7 @@ class StepFacts:
     missing : groups of the set-up in which something is missing.
     is_valid : whether `submission.toml` exists and is valid.
     report : state of the report: "none", "current", "answered" or "older"; see `find_state`.
-    trust, trust_words : status of the last report, in a key and in words; see `ReportStatus`.
+    status : how far the numbers of the last report may be used; None without a report.
     questions, unanswered : numbers of questions in the last report.
     handed : whether the zip was downloaded in its current state.
     check : state of the check; None in a lab that has a report instead.
@@ -49,8 +50,7 @@ class StepFacts:
     missing: tuple[str, ...] = ()
     is_valid: bool = False
     report: str = "none"
-    trust: str = "fine"
-    trust_words: str = ""
+    status: ReportStatus | None = None
     making: bool = False
     questions: int = 0
     unanswered: int = 0
@@ -60,7 +60,8 @@ class StepFacts:
     @property
     def is_doubtful(self) -> bool:
         """Whether the report of the current files says that its numbers may be wrong."""
-        return self.report in ("current", "answered") and self.trust not in ("", "fine")
+        is_current = self.report in ("current", "answered")
+        return is_current and self.status is not None and not self.status.is_fine
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,8 +102,8 @@ def _set_up(facts: StepFacts) -> Status:
 def _report(facts: StepFacts) -> Status:
     if facts.making:
         return "none", "being made"
-    if facts.is_doubtful:
-        return "doubt", facts.trust_words
+    if facts.is_doubtful and facts.status:
+        return "doubt", facts.status.words
     if facts.report == "current":
         return "done", "done"
     if facts.report == "answered":
@@ -295,8 +296,7 @@ def read_room(
             missing=tuple(group.title for group in groups if group.missing),
             is_valid=bool(text) and fault is None,
             report=report,
-            trust=findings["status"]["state"],
-            trust_words=findings["status"]["words"],
+            status=findings["status"],
             making=bool(job and not job.over and job.task[0] == "make_report"),
             questions=len(findings["questions"]),
             unanswered=len(found["unanswered"]),

@@ -239,12 +239,9 @@ def _is_told(name: Name) -> bool:
     return name.is_gain or (name.is_frequency and name.is_mode)
 
 
-_PLACES = {"no_model": "#next", "checks_failed": "#checks"}  # sections that say more about a status
-
-
 def _status_tile(status: ReportStatus) -> Tile:
-    url = _PLACES.get(status.state, "#parameters")
-    return _tile("tile_status", status.words, "", good=status.state == "fine", url=url)
+    url = "#parameters" if status.state == "numbers_disagree" else "#checks"
+    return _tile("tile_status", status.words, "", good=status.is_fine, url=url)
 
 
 def _fit_tile(analysis: Analysis) -> list[Tile]:
