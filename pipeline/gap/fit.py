@@ -87,7 +87,7 @@ class GapFit(GapModel):
     ----------
     covariance : covariance (size, size) of the parameter vector, if dry friction is the same in all
         runs; None before the search ends.
-    varying : the covariance (size, size) that the variation of dry friction adds.
+    between_runs : the covariance (size, size) that the variation of dry friction adds.
     nuisance : the nuisance parameters of each run, in the order of the runs.
     cost : sum of squares of residuals in units of the noise, with prior terms.
     chi_square : the cost without prior terms.
@@ -107,7 +107,7 @@ class GapFit(GapModel):
     run_points: Array
     spread: Array
     covariance: Array | None = field(default=None)
-    varying: Array | float = field(default=0.0)
+    between_runs: Array | float = field(default=0.0)
 
     @property
     def chi(self) -> float:
@@ -616,7 +616,7 @@ def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> Gap
     # The encoders cause no error in a direction that no run determines; its variance is that of
     # H⁻¹.
     np.fill_diagonal(cov, np.maximum(np.diag(cov), least))
-    return replace(fit, covariance=cov, varying=_varying_friction(fit, weighed))
+    return replace(fit, covariance=cov, between_runs=_varying_friction(fit, weighed))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -479,6 +479,24 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
     return chosen
 
 
+def enrich(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothesis:
+    """Replace plain laws by the richer laws that grow from them, if these are worth it.
+
+    The other effects of the first search may have taken the place of a richer law. Every hypothesis
+    tried is appended to `found`.
+    """
+    for effect in chosen.fit.structure.effects:
+        richer = [
+            _replaced(chosen, effect, rich, study)
+            for rich in study.catalogue
+            if rich.grows_from == effect.effect.key
+        ]
+        found += richer
+        better = [h for h in richer if h.is_credible and worth_it(h, chosen, study)]
+        chosen = min([chosen, *better], key=lambda h: h.bic_of_all)
+    return chosen
+
+
 def without_zero_effect(chosen: Hypothesis, final: GapFit, study: Study) -> Hypothesis | None:
     """Return a hypothesis without the least certain effect, if it may be zero; otherwise None.
 
@@ -537,13 +555,21 @@ def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesi
     """Return the hypothesis with a rich law replaced by its simpler form, if that form exists."""
     if rich.effect.grows_from is None:
         return None
-    index = hypothesis.fit.structure.effects.index(rich)
-    effect = find_effect(rich.effect.grows_from)
-    values = [hypothesis.fit.terms[index].values[rich.effect.names.index(name)]
-              for name in effect.names]  # fmt: skip
+    return _replaced(hypothesis, rich, find_effect(rich.effect.grows_from), study)
+
+
+def _replaced(hypothesis: Hypothesis, old: Candidate, effect: Effect, study: Study) -> Hypothesis:
+    """Return the hypothesis with another effect at the place of one of its effects.
+
+    Parameters that both have keep their values; the others start at their typical sizes.
+    """
+    index = hypothesis.fit.structure.effects.index(old)
+    known = old.effect.named(hypothesis.fit.terms[index].values)
     chain = hypothesis.fit.structure.chain(hypothesis.fit.theta)
-    plain = make_candidate(effect, rich.place, values, runs=study.training, chain=chain)
-    model = hypothesis.fit.without(index).with_effect(plain, values)
+    scales = bench_scales(study.training, chain, effect=effect, place=old.place)
+    values = [known.get(p.name, p.size(scales) * p.typical) for p in effect.parameters]
+    new = make_candidate(effect, old.place, values, runs=study.training, chain=chain)
+    model = hypothesis.fit.without(index).with_effect(new, values)
     return judge(fit_on(hypothesis.fit, model, study), study)
 
 

@@ -22,6 +22,7 @@ from pipeline.gap.judge import (
     Study,
     as_model,
     build_up,
+    enrich,
     filled,
     finish,
     fit_free_run,
@@ -225,6 +226,8 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
         sound = [h for h in found if h.is_credible and np.isfinite(h.error)]
         if not chosen.is_credible:
             chosen = prune(min(sound, key=lambda h: h.bic_of_all), study, found)
+        if not study.is_noise(chosen):
+            chosen = enrich(chosen, study, found)
         usable = chosen.is_credible and np.isfinite(chosen.error)
         return chosen if usable else baseline, [h for h in found if h.is_credible]
     found = [h for h in found if np.isfinite(h.error) and h.is_credible]

@@ -131,7 +131,7 @@ def list_effects(
     weight = {key: float(np.exp(-0.5 * (h.bic_of_all - lowest))) for key, h in same_size.items()}
     total, std = sum(weight.values()), None
     if final.covariance is not None:
-        variance = np.diag(final.covariance + final.varying)
+        variance = np.diag(final.covariance + final.between_runs)
         std = np.sqrt(variance) * structure.physical_derivative(final.theta)
     places = [candidate.key for candidate in structure.effects]
     out = []

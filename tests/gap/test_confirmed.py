@@ -12,6 +12,7 @@ from pipeline.gap.judge import build_up, fit_free_run, judge, make_candidate
 from pipeline.gap.pem.fit import start_all
 from pipeline.gap.runs import make_run, split_holdout
 from pipeline.gap.search import OutOfTime, are_followed, find_hypotheses, follow
+from pipeline.gap.summary import repeatability
 from pipeline.plant.catalogue import find_effect
 from pipeline.results import Record
 from pipeline.setup import Setup
@@ -83,6 +84,21 @@ def test_an_input_that_moves_the_cart_at_once_was_not_there_before():
     assert run.command[0] == 0.0
     assert run.knots[0] < run.t[0]
     assert not run.at_rest
+
+
+@pytest.mark.parametrize(("late", "alike"), [(0, True), (1, True), (4, False)])
+def test_repeats_may_be_logged_a_sample_late(late, alike):
+    """Two equal motions are repeats without a difference, though one edge is logged late."""
+    case = make_case(seed=46, n=1, rate=113.1)
+    step = next(record for record in case.records if record.kind == "step")
+    assert step.u is not None
+    again = replace(step, id="again", u=np.concatenate([np.zeros(late), step.u])[: step.t.size])
+
+    found = repeatability([make_run(step, n=1), make_run(again, n=1)])
+
+    # Removing a sample's delay leaves half of (omega h)², 0.7 %; three more samples leave 20 %.
+    assert found is not None
+    assert found < 7e-3 if alike else found > 0.05
 
 
 def test_a_part_of_a_record_keeps_the_earlier_input():

@@ -5,7 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.gap.judge import SURE, fit_free_run, judge, make_candidate, prune, significance
+from pipeline.gap.judge import (
+    SURE,
+    enrich,
+    fit_free_run,
+    judge,
+    make_candidate,
+    prune,
+    significance,
+)
 from pipeline.plant.catalogue import find_effect
 from tests.gap.begun import COULOMB, DAHL, DELAY, begun
 from tests.truth.bench import Hidden
@@ -31,6 +39,27 @@ def test_a_richer_law_that_explains_no_more_is_replaced():
     assert rich.key == {DAHL, DELAY}
     assert pruned.key == {COULOMB, DELAY}
     assert pruned.error < 1.01 * rich.error
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameters", "key"),
+    [
+        ("presliding_friction", {"force": 0.0006, "distance": 0.04}, DAHL),
+        ("coulomb_friction", {"force": 0.0006}, COULOMB),
+    ],
+)
+def test_a_plain_law_becomes_a_richer_one_only_if_that_is_true(effect, parameters, key):
+    """Dry friction becomes presliding friction if the cart's friction builds up over a distance."""
+    fit, study = begun(Hidden(effect=effect, place=1, parameters=parameters))
+    chain = fit.structure.chain(fit.theta)
+    dry = find_effect("coulomb_friction")
+    candidate = make_candidate(dry, 1, (0.0006,), runs=study.training, chain=chain)
+    plain = judge(fit_free_run(fit.with_effect(candidate, (0.0006,)), study), study)
+
+    rich = enrich(plain, study, found=[])
+
+    assert rich.key == {key}
+    assert (rich is plain) == (key == COULOMB)
 
 
 @pytest.mark.parametrize(("value", "nothing"), [(0.015, False), (1e-4, True)])
