@@ -195,7 +195,7 @@ CUBIC_SPRING = Effect(
 
 ASYMMETRIC_SPRING = Effect(
     key="asymmetric_spring",
-    title="Spring that is stiffer on one side",
+    title="Asymmetric spring",
     sentence="The spring becomes stiffer the more it is stretched, and softer the more it is "
     "compressed, or the other way round.",
     place="spring",
