@@ -91,6 +91,14 @@ class FitWindow:
             return 0
         return int(np.searchsorted(self.t, self.drive_t[np.flatnonzero(self.drive_u)[0]]))
 
+    @property
+    def is_constant(self) -> bool:
+        """Whether the input is on from the first sample and never changes.
+
+        If the start is unknown too, its force is indistinguishable from an encoder zero.
+        """
+        return self.drive_u is not None and not np.ptp(self.drive_u)
+
     def rms_in_motion(self, residual: Array) -> Array:
         """Return the root mean square (p,) of residuals (p, n) after the input begins.
 
@@ -670,9 +678,12 @@ def _open(records: Sequence[Record]) -> tuple[list[FitWindow], list[str]]:
             windows.append(open_window(record))
         except DataError as error:
             left_out.append(str(error))
-    if not any(window.drive_u is not None for window in windows):
+    driven = [window for window in windows if window.drive_u is not None]
+    if not driven:
         found = f"found none ({'; '.join(left_out)})" if left_out else "found none"
         raise DataError(f"time fit: needs a record that drives cart 1, {found}")
+    if all(window.is_constant for window in driven):
+        windows = [replace(w, at_rest=w.is_constant and w.kind != "decay") for w in windows]
     return windows, [f"left out: {reason}" for reason in left_out]
 
 
@@ -682,7 +693,7 @@ def _open(records: Sequence[Record]) -> tuple[list[FitWindow], list[str]]:
 def _informed(attempt: Attempt, index: int) -> FitWindow:
     """Return a window with the standard errors and the start condition that its residuals show."""
     window, misfit = attempt.windows[index], attempt.misfits[index]
-    at_rest = window.kind != "decay" and _starts_at_rest(attempt, index)
+    at_rest = window.at_rest or (window.kind != "decay" and _starts_at_rest(attempt, index))
     return window.informed(misfit.residual * window.sigma[:, None], at_rest=at_rest)
 
 

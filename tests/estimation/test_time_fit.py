@@ -168,6 +168,19 @@ def test_a_record_that_starts_in_motion_is_fitted_with_a_note():
     assert np.max(np.abs(errors(fit, chain))) < 4
 
 
+def test_a_record_whose_input_is_always_on_starts_from_rest():
+    """If the log begins at the step and the input never changes, the gain is found all the same."""
+    rng = np.random.default_rng(7)
+    chain = PRESETS["throne-1dof"]
+    t = np.arange(600) / 113.0
+    u = np.full(t.size, 1.0 / chain.static_gains()[0])
+    y = simulate_linear(chain, t, u)
+    record = record_of(t, u, y + 0.0005 * rng.standard_normal(y.shape), kind="step")
+    fit = fit_records([record], bench=Setup(springs=(True, False)))
+    assert fit.converged
+    assert np.max(np.abs(errors(fit, chain))) < 4
+
+
 def test_a_cart_that_was_not_measured_is_still_found():
     """If the middle cart was not measured, the other two still determine it."""
     rng = np.random.default_rng(5)

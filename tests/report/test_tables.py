@@ -3,6 +3,7 @@
 from dataclasses import replace
 from decimal import Decimal
 
+from pipeline.estimation.estimates import list_off
 from pipeline.report.builder import Page
 from pipeline.report.sections.measurements import dwell_table
 from pipeline.report.sections.parameters import parameter_table, reported_table
@@ -14,7 +15,9 @@ from tests.helpers.pages import rows
 
 def page(estimates, reported=None) -> Page:
     """Return a page of one cart with these estimates and reported numbers."""
-    return Page(replace(make_analysis(1), rows=tuple(estimates), reported=reported or {}))
+    typed = reported or {}
+    analysis = replace(make_analysis(1), rows=tuple(estimates), reported=typed)
+    return Page(replace(analysis, reported_off=list_off(analysis.rows, typed)))
 
 
 def test_a_wrong_reported_number_gets_a_hint():

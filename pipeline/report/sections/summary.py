@@ -20,7 +20,7 @@ from pipeline.report.document import (
 from pipeline.report.sections.housekeeping import taken_text
 from pipeline.report.sections.loops import CLOSE
 from pipeline.report.sections.measurements import overview_blocks
-from pipeline.results import Analysis, Check, HardwareCheck, ParameterRow, ReportStatus, Stage
+from pipeline.results import Analysis, Check, HardwareCheck, ParameterRow, Stage
 from pipeline.words.numbers import (
     NOTHING,
     count,
@@ -95,7 +95,7 @@ def summary(page: Page) -> list[Block]:
     blocks: list[Block] = [_identified(analysis)]
     findings = _findings(analysis)
     verdicts = [
-        _status_tile(analysis.status),
+        _status_tile(analysis),
         *_fit_tile(analysis),
         *(one.tile for one in findings if one.tile),
     ]
@@ -239,8 +239,10 @@ def _is_told(name: Name) -> bool:
     return name.is_gain or (name.is_frequency and name.is_mode)
 
 
-def _status_tile(status: ReportStatus) -> Tile:
+def _status_tile(analysis: Analysis) -> Tile:
+    status = analysis.status
     url = "#parameters" if status.state == "numbers_disagree" else "#checks"
+    url = url if analysis.checks else "#skipped" if analysis.skipped else ""
     return _tile("tile_status", status.words, "", good=status.is_fine, url=url)
 
 
