@@ -25,7 +25,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGET = ROOT / ".ci" / "prose.toml"
-ROOTS = "README.md CONTRIBUTING.md CHANGELOG.md docs rubrics templates pipeline benchmarks tests"
+ROOTS = (
+    "README.md AGENTS.md CONTRIBUTING.md CHANGELOG.md docs rubrics templates pipeline benchmarks "
+    "tests"
+)
 KINDS = {".py", ".md", ".j2", ".html", ".toml"}
 LONGEST = 38  # words in a sentence; above it a reader has to go back
 MESSAGE = 5  # a string in a program counts as text from this number of words on

@@ -19,6 +19,7 @@ from pipeline.words.math import to_mathml, to_tex
 ROOT = Path(__file__).parents[1]
 _SHOWN = (
     "README.md",
+    "AGENTS.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "docs/*.md",

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130  # exit status, as usual after Ctrl-C
 STOPPED = "stopped; repeat the command to start again"
-# The modules of commands; `cartlab --help` lists the commands in this order: as a lab needs them.
 _MODULES = ("reports", "bench", "grading", "desk", "demo", "doctor")
 
 

@@ -14,9 +14,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
 from pipeline import __version__
@@ -24,8 +25,33 @@ from pipeline.cli import INTERRUPTED, STOPPED
 from pipeline.errors import PipelineError, is_disk_full, is_file_fault
 from pipeline.words.progress import Progress
 
+# `cartlab --help` lists the commands by role, in this order; the others are under MORE.
+ROLES = {
+    "Students": ("fill", "inspect", "report", "check", "gap", "desk"),
+    "TAs": ("grade", "override", "adjust", "history", "export", "check-rubric"),
+    "Instructors": ("new", "plan", "acquire", "explore", "simulate", "solution"),
+}
+MORE = "More"
+
+
+class _ByRole(TyperGroup):
+    """The commands, listed by the role of the user."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write one list of commands for each role."""
+        of_roles = {name for names in ROLES.values() for name in names}
+        others = tuple(name for name in self.commands if name not in of_roles)
+        width = formatter.width - max(map(len, self.commands)) - 6
+        for role, names in {**ROLES, MORE: others}.items():
+            with formatter.section(role):
+                formatter.write_dl(
+                    [(name, self.commands[name].get_short_help_str(width)) for name in names]
+                )
+
+
 app = typer.Typer(
     name="cartlab",
+    cls=_ByRole,
     help="Lab reports and identification for carts on springs: from raw bench data to the plant, "
     "a controller and a report.",
     add_completion=False,

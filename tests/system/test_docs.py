@@ -2,17 +2,22 @@
 
 import re
 import shlex
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from typer.main import get_command
 
 from pipeline.cli import app, main
+from pipeline.cli.common import MORE, ROLES
+from tests.helpers.commandline import cartlab_here
 from tests.helpers.places import ROOT
 
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+TOP = ("README.md", "AGENTS.md", "CONTRIBUTING.md")
+PAGES = [*(ROOT / name for name in TOP), *sorted((ROOT / "docs").glob("*.md"))]
 _BLOCK = re.compile(r"^```sh\n(.*?)^```", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 COMMANDS = get_command(app).commands  # pyright: ignore[reportAttributeAccessIssue]
@@ -68,16 +73,81 @@ def test_the_slow_commands_of_a_page_work(page, monkeypatch, tmp_path):
     run_page(page, monkeypatch, tmp_path, slow=True)
 
 
+def own_rig(folder: Path, *, seed: int) -> None:
+    """Write recordings of a simulated cart as those of the rig on the page, without a table."""
+    cartlab_here("simulate", "--preset", "throne-1dof", "--seed", seed, "--out", folder / "bench")
+    columns = {"time": ("t / s", 1), "input": ("current (A)", 2), "x1": ("carriage (mm)", 10)}
+    (folder / "data").mkdir()
+    for file in (folder / "bench" / "data").glob("*.csv"):
+        if file.stem.startswith(("decay", "step", "sweep")):
+            frame = pd.read_csv(file)[list(columns)]
+            for name, (_, scale) in columns.items():
+                frame[name] *= scale
+            frame.columns = [heading for heading, _ in columns.values()]
+            frame.to_csv(folder / "data" / file.name, sep=";", decimal=",", index=False)
+    shutil.rmtree(folder / "bench")
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_page_on_an_own_lab_works(monkeypatch, tmp_path):
+    """With a rig's files, every command and table of the page works and earns all points."""
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs" / "own-lab.md").read_text(encoding="utf-8")
+    own_rig(tmp_path / "my-rig", seed=1)
+    ran = []
+    for kind, block in re.findall(r"^```(sh|toml)\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+        if kind == "toml":
+            path = Path(block.split()[1].rstrip(","))
+            before = path.read_text(encoding="utf-8") if "at the end" in block else ""
+            path.write_text(before + block, encoding="utf-8")
+            continue
+        for line in block.splitlines():
+            command, *arguments = shlex.split(line)
+            assert command == "cartlab"
+            if "class" in arguments:
+                for seed, team in ((2, "team-1"), (3, "team-2")):
+                    own_rig(tmp_path / "class" / team, seed=seed)
+                    tables = (tmp_path / "my-rig" / "submission.toml").read_text(encoding="utf-8")
+                    tables = tables.replace('"instructor"', f'"{team}"')
+                    (tmp_path / "class" / team / "submission.toml").write_text(
+                        tables, encoding="utf-8"
+                    )
+            done = cartlab_here(*arguments)
+            assert done.returncode == 0, done.stderr
+            ran.append(arguments[0])
+    assert {"fill", "report", "check", "grade", "export"} <= set(ran)
+    for folder in ("trial", "grades"):
+        table = pd.read_csv(tmp_path / folder / "grades.csv")
+        assert set(table["points"]) == {10}
+
+
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_every_command_and_option_is_documented(command):
     """`docs/commands.md` has a section for each command, with each of its options."""
     text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
-    sections = re.split(r"^## ", text, flags=re.MULTILINE)
+    sections = re.split(r"^### ", text, flags=re.MULTILINE)
     (section,) = [s for s in sections if re.match(rf"`cartlab {command}(?![\w-])", s)]
     for parameter in COMMANDS[command].params:
         for option in (*parameter.opts, *parameter.secondary_opts):
             if option.startswith("--") and option not in ("--help", "--pdf"):
                 assert option in section, f"{command} {option}"
+
+
+@pytest.mark.parametrize(
+    ("page", "group", "command"),
+    [
+        ("README.md", r"^- \*\*(\w+):\*\* (.*?)(?=^- \*\*|\n\n)", r"`cartlab ([\w-]+)`"),
+        ("docs/commands.md", r"^## (\w+)\n(.*?)(?=^## |\Z)", r"^### `cartlab ([\w-]+)"),
+    ],
+)
+def test_commands_are_grouped_by_role(page, group, command):
+    """README and `docs/commands.md` group the commands as `cartlab --help` does."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    groups = re.findall(group, text, re.DOTALL | re.MULTILINE)
+    listed = {role: re.findall(command, part, re.MULTILINE) for role, part in groups}
+    assert {role: tuple(listed[role]) for role in ROLES} == ROLES
+    assert set(listed[MORE]) == set(COMMANDS) - {name for names in ROLES.values() for name in names}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
