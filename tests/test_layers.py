@@ -43,6 +43,8 @@ HOMES = {
     "jinja2": ("report.html", "submission", "desk", "plant.export"),
     "typst": ("report.pdf",),
     "markdown_it": ("report.sections",),
+    "mdit_py_plugins": ("report.sections",),
+    "latex2mathml": ("report.equations",),
     "typer": ("cli",),
     "rich": ("cli", "bench"),
     "serial": ("bench",),

@@ -16,12 +16,21 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 _OPERATORS = frozenset("+−=·,()[]≥≤<≈≠→")
 _RELATIONS = frozenset("=≥≤<≈≠→")
 
-MathKind = Literal["row", "fraction", "sub", "sup", "dot", "ddot", "matrix", "parens", "lines"]
+MathKind = Literal[
+    "row", "fraction", "sub", "sup", "dot", "ddot", "matrix", "parens", "lines",
+    # Only in formulas that students typed:
+    "text", "operator", "accent", "sqrt", "root", "limits", "fenced", "table",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Math:
-    """A node; `columns` is the number of columns of a matrix, whose parts are in rows."""
+    """A node; `columns` is the number of columns of a matrix, whose parts are in rows.
+
+    "text" and "operator" have one string as their part. "accent" has a base and a mark, "root" a
+    base and a degree, "limits" a base and what stands below and above it, and "fenced" what it
+    encloses between two brackets; "" stands for nothing. "table" is a matrix without brackets.
+    """
 
     kind: MathKind
     parts: tuple["Term", ...]
@@ -138,6 +147,26 @@ def _mathml(term: Term) -> str:
     parts = [_mathml(part) for part in term.parts]
     inside = "".join(parts)
     match term.kind:
+        case "text":
+            return f"<mtext>{escape(str(term.parts[0]))}</mtext>"
+        case "operator":
+            return f'<mo stretchy="false">{escape(str(term.parts[0]))}</mo>'
+        case "accent":
+            return f'<mover accent="true">{parts[0]}<mo>{escape(str(term.parts[1]))}</mo></mover>'
+        case "sqrt":
+            return f"<msqrt>{inside}</msqrt>"
+        case "root":
+            return f"<mroot>{inside}</mroot>"
+        case "limits":
+            tag = "munderover" if all(term.parts) else "munder" if term.parts[1] else "mover"
+            shown = "".join(mathml for part, mathml in zip(term.parts, parts, strict=True) if part)
+            return f"<{tag}>{shown}</{tag}>"
+        case "fenced":
+            left, right = (
+                f'<mo fence="true" stretchy="true" form="{form}">{escape(str(end))}</mo>'
+                for form, end in (("prefix", term.parts[0]), ("postfix", term.parts[2]))
+            )
+            return f"<mrow>{left}{parts[1]}{right}</mrow>"
         case "row":
             return f"<mrow>{inside}</mrow>"
         case "parens":
@@ -159,19 +188,20 @@ def _mathml(term: Term) -> str:
         case "lines":
             rows = "".join(f"<mtr>{_aligned(part)}</mtr>" for part in term.parts)
             return f'<mtable class="lines" displaystyle="true">{rows}</mtable>'
-        case "matrix":
+        case "matrix" | "table":
             cells = [f"<mtd>{part}</mtd>" for part in parts]
             rows = [
                 "<mtr>" + "".join(cells[i : i + term.columns]) + "</mtr>"
                 for i in range(0, len(cells), term.columns)
             ]
-            return f"<mrow><mo>[</mo><mtable>{''.join(rows)}</mtable><mo>]</mo></mrow>"
+            table = f"<mtable>{''.join(rows)}</mtable>"
+            return table if term.kind == "table" else f"<mrow><mo>[</mo>{table}<mo>]</mo></mrow>"
 
 
 def _is_tall(term: Term) -> bool:
     if isinstance(term, str):
         return False
-    return term.kind in ("fraction", "matrix") or any(map(_is_tall, term.parts))
+    return term.kind in ("fraction", "matrix", "table", "sqrt") or any(map(_is_tall, term.parts))
 
 
 def _aligned(line: Term) -> str:
@@ -203,8 +233,15 @@ def to_text(term: Term) -> str:
         return f" {term} " if term in _RELATIONS or term in "+" else term
     parts = [to_text(part) for part in term.parts]
     match term.kind:
-        case "row":
+        case "row" | "text" | "operator" | "accent" | "fenced":
             return "".join(parts)
+        case "sqrt":
+            return f"√({parts[0]})"
+        case "root":
+            return f"√[{parts[1]}]({parts[0]})"
+        case "limits":
+            marks = zip("_^", parts[1:], strict=True)
+            return parts[0] + "".join(f"{mark}({part})" for mark, part in marks if part)
         case "parens":
             return f"({''.join(parts)})"
         case "fraction":
@@ -219,7 +256,7 @@ def to_text(term: Term) -> str:
             return f"{parts[0]}″"
         case "lines":
             return "; ".join(parts)
-        case "matrix":
+        case "matrix" | "table":
             width = term.columns
             rows = [", ".join(parts[i : i + width]) for i in range(0, len(parts), width)]
             return f"[{'; '.join(rows)}]"

@@ -104,11 +104,12 @@ def test_control_characters_are_replaced():
 
 @given(st.text(alphabet=st.sampled_from("ab<>&\"'`*_[]()!#-|\n \\$:/h1.{}%~+="), max_size=80))
 def test_any_text_gives_a_page_without_foreign_tags(markdown):
-    """Whatever the notes contain, the page has only the tags of its template."""
+    """Whatever the notes contain, the page has only the tags of its template and of formulas."""
     html = page(markdown)
     names = set(re.findall(r"<\s*/?\s*([a-zA-Z][\w-]*)", html))
     ours = "section h2 h3 h4 h5 h6 p ul ol li em strong code pre blockquote a div table thead tbody"
-    assert names <= {*ours.split(), "tr", "th", "td", "main", "footer", "body", "html"}
+    formulas = "math mrow mi mn mo mtext mfrac msub msup msubsup mover munder munderover".split()
+    assert names <= {*ours.split(), *formulas, "tr", "th", "td", "main", "footer", "body", "html"}
 
 
 @settings(max_examples=20)

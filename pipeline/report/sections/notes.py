@@ -2,19 +2,32 @@
 
 An answer in `notes.md` follows a heading that begins with the id of its question. Raw HTML is shown
 as text. Images are replaced by their descriptions. Only links to web and mail addresses are kept.
+LaTeX between dollars is typeset; a formula that cannot be typeset is shown as typed.
 """
 
 import re
 from collections.abc import Iterable
-from itertools import pairwise
 from urllib.parse import urlsplit
 
 from markdown_it import MarkdownIt
 from markdown_it.tree import SyntaxTreeNode
+from mdit_py_plugins.dollarmath import dollarmath_plugin
 
 from pipeline.errors import SubmissionError
-from pipeline.report.document import Block, Cell, Code, Heading, Items, Paragraph, Quote, Table
+from pipeline.report.document import (
+    Block,
+    Cell,
+    Code,
+    Formula,
+    Heading,
+    Items,
+    Paragraph,
+    Quote,
+    Table,
+)
+from pipeline.report.equations.latex import LatexError, read_latex
 from pipeline.submission.load import COMMENT
+from pipeline.words.math import to_text
 from pipeline.words.text import Span, Spans, clean, plain
 
 _DEEPEST_HEADING = 6
@@ -25,6 +38,7 @@ _DEEPEST_NESTING = 6
 # so many characters without a space are longer than any address and wider than any page
 _ENDLESS = re.compile(r"\S{2000}")
 _SCHEMES = ("http", "https", "mailto")
+_FORMULAS = ("math_inline", "math_inline_double", "math_block")
 _ALIGN = {"text-align:center": "c", "text-align:right": "r"}
 
 _LEAD = re.compile(r"(?:question|q|answer|a)?[\s:.#]*([\w.-]+)", re.IGNORECASE)
@@ -38,12 +52,44 @@ _OPEN = (
 
 def note_blocks(markdown: str) -> tuple[Block, ...]:
     """Return Markdown as blocks of text; if it is nested too deeply, show it as typed."""
-    text = _ENDLESS.sub(r"\g<0> ", clean(markdown))
-    parser = MarkdownIt("commonmark", {"html": False, "maxNesting": _DEEPEST_READ}).enable("table")
+    text = _readable(markdown)
     try:
-        return _blocks(SyntaxTreeNode(parser.parse(text)))
+        return _blocks(_tree(text))
     except RecursionError:
         return (Code(text),)
+
+
+def formula_problems(markdown: str) -> list[str]:
+    """Return the formulas that are shown as typed, each with the reason."""
+    found: dict[str, str] = {}
+    try:
+        for node in _tree(_readable(markdown)).walk():
+            if node.type in _FORMULAS:
+                try:
+                    read_latex(node.content)
+                except LatexError as error:
+                    found[_as_typed(node)] = str(error)
+    except RecursionError:
+        return []
+    return [f"{typed} is shown as typed: {why}" for typed, why in found.items()]
+
+
+def _readable(markdown: str) -> str:
+    return _ENDLESS.sub(r"\g<0> ", clean(markdown))
+
+
+def _tree(markdown: str) -> SyntaxTreeNode:
+    parser = MarkdownIt("commonmark", {"html": False, "maxNesting": _DEEPEST_READ}).enable("table")
+    # Dollars next to a digit or a space are amounts of money.
+    parser.use(
+        dollarmath_plugin,
+        allow_labels=False,
+        allow_space=False,
+        allow_digits=False,
+        allow_blank_lines=False,
+        double_inline=True,
+    )
+    return SyntaxTreeNode(parser.parse(markdown))
 
 
 def discussion_blocks(markdown: str) -> tuple[Block, ...]:
@@ -98,8 +144,23 @@ def _block(node: SyntaxTreeNode, depth: int) -> list[Block]:
             return [Code(node.content.rstrip("\n"))]
         case "table":
             return [_table(node)]
+        case "math_block":
+            return [_displayed(node)]
         case _:  # a horizontal rule has no meaning here
             return []
+
+
+def _displayed(node: SyntaxTreeNode) -> Block:
+    try:
+        math = read_latex(node.content, display=True)
+    except LatexError:
+        return Code(_as_typed(node))
+    return Formula(math, alt=to_text(math))
+
+
+def _as_typed(node: SyntaxTreeNode) -> str:
+    mark = "$" if node.type == "math_inline" else "$$"
+    return f"{mark}{node.content.strip()}{mark}"
 
 
 def _plain(node: SyntaxTreeNode) -> str:
@@ -107,7 +168,8 @@ def _plain(node: SyntaxTreeNode) -> str:
 
     It works without recursion, because there may be a thousand levels.
     """
-    return " ".join(n.content for n in node.walk() if n.type in ("text", "code_inline", "fence"))
+    shown = ("text", "code_inline", "fence", *_FORMULAS)
+    return " ".join(n.content for n in node.walk() if n.type in shown)
 
 
 def _table(node: SyntaxTreeNode) -> Table:
@@ -142,6 +204,12 @@ def _spans(node: SyntaxTreeNode, around: Span) -> list[Span]:
             return [Span(" ")]
         case "code_inline":
             return [Span(node.content, "code", around.url)]
+        case "math_inline" | "math_inline_double":
+            try:
+                math = read_latex(node.content)
+            except LatexError:
+                return [Span(_as_typed(node), "code")]
+            return [Span(to_text(math), math=math)]
         case "image":
             return [Span(f"[image: {node.content}]", "em")]
         case "strong":
@@ -234,10 +302,8 @@ def _bodies(notes: str) -> dict[str, tuple[int, str]]:
 def _headings(markdown: str) -> list[tuple[int, int, int, str]]:
     """Return level, first line, next line, and text of each heading outside comments."""
     text = COMMENT.sub(lambda found: re.sub(r"[^\n]", " ", found[0]), markdown)
-    tokens = MarkdownIt("commonmark", {"html": False}).parse(text)
-    found = []
-    for heading, inline in pairwise(tokens):
-        if heading.type == "heading_open" and heading.level == 0 and heading.map:
-            words = "".join(one.content for one in inline.children or ())
-            found.append((int(heading.tag[1:]), *heading.map, words))
-    return found
+    return [
+        (int(node.tag[1:]), *node.map, plain(_inline(node)))
+        for node in _tree(text).children
+        if node.type == "heading" and node.map
+    ]
