@@ -179,7 +179,7 @@ def run_report(
     """Write the report of a submission and print a short summary.
 
     A second process loads what draws the report while this one loads what analyses the data. The
-    desk shows a complete report in the submission's own folder as one of its own.
+    desk shows a report in the submission's own folder as one of its own.
     """
     with SecondProcess("pipeline.report.lab_report", "make_draft") as second:
         from pipeline.desk.last_report import stat_sources, write_findings
@@ -189,14 +189,14 @@ def run_report(
         # Note the state before the files are read, so that the desk notices a later change.
         made_of = stat_sources(folder if folder.is_dir() else folder.parent)
         submission = _load(folder)
-        is_for_desk = out is None and files.pdf
-        out = named_folder(out) if out else own_folder(submission.folder, "report")
+        own = own_folder(submission.folder, "report")
+        out = named_folder(out) if out else own
         compared = _comparison(compare, submission)
         with progress_line() as progress:
             analysis, changes, draft = make_report(
                 submission, out, compared=compared, make=second.do, files=files, progress=progress
             )
-        if is_for_desk:
+        if out.resolve() == own.resolve():
             write_findings(analysis, out, changes=changes, made_of=made_of)
     for line in (draft.summary, *_unreadable(analysis), *draft.remarks):
         say(line)

@@ -129,6 +129,7 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/student/{n:nth}/compare", "GET", result_pages.show_plots),
     ("/student/{n:nth}/compare", "POST", result_pages.make_plots),
     ("/student/{n:nth}/answer", "POST", result_pages.answer),
+    ("/student/{n:nth}/discussion", "POST", result_pages.write_discussion),
     ("/student/{n:nth}/state-signs", "POST", result_pages.state_signs),
     ("/student/{n:nth}/check", "GET", result_pages.show_check),
     ("/student/{n:nth}/check", "POST", result_pages.begin_check),

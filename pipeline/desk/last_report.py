@@ -26,6 +26,7 @@ NO_FINDINGS: Mapping[str, Any] = {
     "questions": [], "assumed": [], "contradicted": [], "failed": [], "changes": "", "turned": {},
     "status": None,
 }  # fmt: skip
+PDF = "report/report.pdf"
 PLOTS = "report/compare.html"
 PLOTS_OF = "report/plots.json"  # state of the sources of the plots
 

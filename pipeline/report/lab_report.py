@@ -31,7 +31,7 @@ from pipeline.report.sections.measurements import (
     response_blocks,
     step_blocks,
 )
-from pipeline.report.sections.notes import discussion_blocks
+from pipeline.report.sections.notes import discussion_blocks, formula_problems
 from pipeline.report.sections.parameters import chain_table, parameter_blocks
 from pipeline.report.sections.questions import (
     Asked,
@@ -176,7 +176,11 @@ def make_draft(
     progress: Progress = silent,
 ) -> Draft:
     """Return the report of an analysis."""
-    lines = (changes and with_symbols(changes_line(changes)), open_line(analysis))
+    lines = (
+        changes and with_symbols(changes_line(changes)),
+        open_line(analysis),
+        *(f"notes.md: {line}" for line in formula_problems(analysis.discussion or "")),
+    )
     return Draft(
         files=_make_files(analysis, gap=gap, changes=changes, files=files, progress=progress),
         summary=terminal_summary(analysis),

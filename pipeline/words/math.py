@@ -27,9 +27,9 @@ MathKind = Literal[
 class Math:
     """A node; `columns` is the number of columns of a matrix, whose parts are in rows.
 
-    "text" and "operator" have one string as their part. "accent" has a base and a mark, "root" a
-    base and a degree, "limits" a base and what stands below and above it, and "fenced" what it
-    encloses between two brackets; "" stands for nothing. "table" is a matrix without brackets.
+    The parts of "text" and "operator" are one string; of "accent" a base and a mark; of "root" a
+    base and a degree; of "limits" a base, a lower and an upper term; of "fenced" a bracket, a term
+    and a bracket. An empty string stands for nothing. "table" is a matrix without brackets.
     """
 
     kind: MathKind

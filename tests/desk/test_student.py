@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from html import unescape
+from html import escape, unescape
 from pathlib import Path
 from urllib.parse import unquote, urlencode
 
@@ -57,7 +57,7 @@ def filled(tmp_path) -> Iterator[tuple[Visitor, Path]]:
 
 def save(visitor: Visitor, where: str = "save", *, seen: str = "", **fields: str) -> Answer:
     """Send a form of the page as it is now."""
-    shown = HERE + ("questions" if where == "answer" else "")
+    shown = HERE + ("questions" if where in ("answer", "discussion") else "")
     return visitor.post(HERE + where, seen=seen or visitor.get(shown).value("seen"), **fields)
 
 
@@ -237,7 +237,9 @@ def test_handing_in_warns_of_open_questions(filled):
         assert f'action="{HERE}hand-in"' in page.text
 
 
-@pytest.mark.parametrize("change", ["number", "answer", "older", "gone", "gap", "nothing"])
+@pytest.mark.parametrize(
+    "change", ["number", "answer", "discussion", "older", "gone", "gap", "nothing"]
+)
 def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
     """If anything has changed since the report, the page says so and the zip lacks the report."""
     visitor, folder = filled
@@ -247,6 +249,8 @@ def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
         save(visitor, **{"reported.final.K": "1.25"})
     elif change == "answer":
         save(visitor, "answer", id="zeta", answer="So.")
+    elif change == "discussion":
+        save(visitor, "discussion", discussion="So.")
     elif change == "older":
         file.write_bytes(file.read_bytes() + b"\n")
         os.utime(file, (1e9, 1e9))
@@ -257,12 +261,13 @@ def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
     elif change == "gap":
         (folder / "gap").mkdir()
         (folder / "gap" / "gap.json").write_text("{}", encoding="utf-8")
-    expected = {"nothing": "current", "answer": "answered"}.get(change, "older")
+    written = {"nothing": "current", "answer": "answered", "discussion": "answered"}
+    expected = written.get(change, "older")
     for page in (visitor.get(HERE), visitor.get(HERE + "hand-in")):
         assert page.state["report"] == expected
         assert ("The report is out of date" in page.text) == (expected == "older")
     top = visitor.get(HERE).text.partition('class="now')[2].partition('class="next')[0]
-    said = {"older": "out of date", "current": "up to date", "answered": "answers are newer"}
+    said = {"older": "out of date", "current": "up to date", "answered": "are newer than"}
     assert [state for state, words in said.items() if words in top] == [expected]
     assert ("report/report.pdf" in zipped(visitor).namelist()) == (change == "nothing")
 
@@ -441,6 +446,46 @@ def test_an_answer_that_is_refused_stays_on_the_page(filled):
     (folder / "notes.md").write_bytes(b"\xff")
     page = save(visitor, "answer", seen=seen, id="zeta", answer="So.")
     assert (page.status, "So.</textarea>" in page.text) == (422, True)
+
+
+def test_the_discussion_is_written_beside_the_answers(filled):
+    """The form writes the discussion into `notes.md`; answers, comments and formulas stay."""
+    visitor, folder = filled
+    notes = folder / "notes.md"
+    ask_for(folder, "zeta")
+    notes.write_text("<!-- mine -->\n## zeta\n\nDry.\n\n## Outlook\n\nMore.\n", encoding="utf-8")
+    page = visitor.get(HERE + "questions")
+    assert "&lt;!-- mine --&gt;\n## Outlook\n\nMore.</textarea>" in page.text
+    assert save(visitor, "discussion", discussion="As $\\zeta_b$ & <b>.").status == 303
+    assert notes.read_text(encoding="utf-8") == "As $\\zeta_b$ & <b>.\n\n## zeta\n\nDry.\n"
+    page = visitor.get(HERE + "questions")
+    assert 'class="said refused"' not in page.text
+    assert "As $\\zeta_b$ &amp; &lt;b&gt;.</textarea>" in page.text
+
+    save(visitor, "discussion", discussion="As $\\foo$ and $\\bar x$.")
+    said = re.findall('class="said refused">(.*?)</p>', visitor.get(HERE + "questions").text)
+    assert [line.partition(" is ")[0] for line in said] == [r"$\foo$"]
+    assert save(visitor, "discussion", discussion="").status == 303
+    assert notes.read_text(encoding="utf-8") == "## zeta\n\nDry.\n"
+
+
+def test_a_discussion_that_is_refused_stays_on_the_page(filled):
+    """A discussion that would change an answer, or is outdated, is refused and shown again."""
+    visitor, folder = filled
+    ask_for(folder, "zeta")
+    notes = folder / "notes.md"
+    notes.write_text("## zeta\n\nMine.\n", encoding="utf-8")
+    seen = visitor.get(HERE + "questions").value("seen")
+    for words in ("So.\n```", "So <!-- why", "## Zeta\n\nHers.", "x" * 1_000_001):
+        page = save(visitor, "discussion", seen=seen, discussion=words)
+        assert page.status == 422
+        assert len(wrongs(page.text)) == 2  # at the top and at the discussion
+        assert f"{escape(words)}</textarea>" in page.text
+    assert notes.read_text(encoding="utf-8") == "## zeta\n\nMine.\n"
+    save(visitor, "answer", id="zeta", answer="Hers.")
+    page = save(visitor, "discussion", seen=seen, discussion="Too late.")
+    assert (page.status, "Too late." in page.text) == (409, True)
+    assert notes.read_text(encoding="utf-8") == "## zeta\n\nHers.\n"
 
 
 TYPO = "\n[reported.final]\nK_1 {}\n"

@@ -5,7 +5,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SubmissionError
-from pipeline.report.sections.notes import discussion_blocks, with_answer, written_answer
+from pipeline.report.sections.notes import (
+    discussion_blocks,
+    with_answer,
+    with_discussion,
+    written_answer,
+    written_discussion,
+)
 from pipeline.report.sections.questions import Asked, split_notes
 
 NOTES = """\
@@ -90,3 +96,37 @@ def test_an_answer_is_read_back_unchanged(lines, answer, at):
     asked = [Asked(kind="level", id="level", section="x", text="")]
     assert bool(split_notes(discussion_blocks(new), asked)[0]) == bool(discussion_blocks(answer))
     assert written_answer(new, "level") == answer.strip()
+
+
+@given(
+    st.lists(st.sampled_from(["zeta_b", "x", "level"]) | WORDS, max_size=6),
+    st.lists(
+        WORDS | st.sampled_from(["# x", "```", "### y", "<!--", "$$", "## level"]), max_size=4
+    ),
+)
+def test_a_discussion_is_read_back_unchanged(parts, typed):
+    """A discussion is refused, or read back unchanged beside unchanged answers."""
+    notes = "\n\n".join(f"## {one}\n\nabout {one}" if one.isascii() else one for one in parts)
+    ids, discussion = ("level", "zeta_b"), "\n\n".join(typed)
+    try:
+        new = with_discussion(notes, ids, discussion)
+    except SubmissionError:
+        return
+    assert written_discussion(new, ids) == discussion.strip()
+    assert [written_answer(new, id_) for id_ in ids] == [written_answer(notes, id_) for id_ in ids]
+    assert with_discussion(new, ids, discussion) == new
+
+
+def test_a_discussion_stands_before_the_answers():
+    """The discussion is all that answers no question; it is written before the answers."""
+    ids = ("zeta_b", "friction-2")
+    rest = written_discussion(NOTES, ids)
+    assert rest.startswith("<!-- keep\n## zeta_b")
+    assert "friction-2" not in rest
+    assert rest.endswith("## Outlook\n\nMore.")
+    new = with_discussion(NOTES, ids, "All is new.")
+    assert new.startswith("All is new.\n\n## Question **friction-2**: why?\n\nBecause.")
+    assert with_discussion("", ids, "") == ""
+    for text in ("## zeta_b\n\nSo.", "```\nopen", "<!-- open"):
+        with pytest.raises(SubmissionError):
+            with_discussion(NOTES, ids, text)

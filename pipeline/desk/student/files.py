@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from pipeline.desk.jobs import WorkerPool
-from pipeline.desk.last_report import NOTES, find_state
+from pipeline.desk.last_report import NOTES, PDF, find_state
 from pipeline.desk.page_request import Message
 from pipeline.desk.served_files import scratch_folder
 from pipeline.errors import SubmissionError
@@ -216,8 +216,7 @@ def _is_sound(folder: Path, name: str) -> bool:
 
 # ----------------------------------------------------------------------------- the files to hand in
 
-_REPORT = "report/report.pdf"
-BESIDE = (NOTES, CHECKS, _REPORT)
+BESIDE = (NOTES, CHECKS, PDF)
 _MADE = ("report", "gap", "solution")  # folders of computed results, which contain no recordings
 
 
@@ -235,7 +234,7 @@ def list_held(folder: Path, *, report: bool = True) -> list[str]:
 
 def list_beside(folder: Path, *, report: bool = True) -> list[str]:
     """Return which files of `BESIDE` go into the zip; an outdated report is left out."""
-    left_out = "" if report and find_state(folder) == "current" else _REPORT
+    left_out = "" if report and find_state(folder) == "current" else PDF
     return [name for name in BESIDE if name != left_out and file_problem(folder, name) is None]
 
 

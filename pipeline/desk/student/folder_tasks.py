@@ -5,7 +5,7 @@ The desk's own process answers everybody, so it parses nothing that a student wr
 
 import tomllib
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,13 @@ from pipeline.identify.springs import find_springs
 from pipeline.ingest.fill import UNSURE, data_files, experiment_doubts, system_doubts
 from pipeline.lock import lock_when_free
 from pipeline.output import write_file
-from pipeline.report.sections.notes import with_answer, written_answer
+from pipeline.report.sections.notes import (
+    formula_problems,
+    with_answer,
+    with_discussion,
+    written_answer,
+    written_discussion,
+)
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.edit import (
     Stale,
@@ -264,7 +270,10 @@ def pack_hand_in(
 
 
 def read_questions(folder: str, ids: Sequence[str], *, progress: Progress) -> dict[str, Any]:
-    """Return the answers in `notes.md` by question, the digest of the file, and what is wrong.
+    """Return the answers by question and the discussion, as `notes.md` has them.
+
+    The keys are `answers`, `discussion`, the digest of the file (`seen`), and what is wrong with it
+    (`problem`).
 
     Parameters
     ----------
@@ -275,34 +284,62 @@ def read_questions(folder: str, ids: Sequence[str], *, progress: Progress) -> di
         notes = read_notes(Path(folder))
     except SubmissionError as error:
         problem = str(error)
-    known = [one["id"] for one in read_findings(Path(folder))["questions"]]
-    answers = {id_: written_answer(notes, id_) for id_ in [*known, *ids]}
-    return {"answers": answers, "seen": text_digest(notes), "problem": problem}
+    known = _asked(Path(folder))
+    return {
+        "answers": {id_: written_answer(notes, id_) for id_ in [*known, *ids]},
+        "discussion": written_discussion(notes, known),
+        "seen": text_digest(notes),
+        "problem": problem,
+    }
 
 
 def answer_question(
     folder: str, id_: str, words: str, seen: str, *, progress: Progress
-) -> dict[str, str]:
-    """Write an answer into `notes.md`; return {}, or the present text of a `stale` file.
+) -> dict[str, Any]:
+    """Write an answer into `notes.md`; see `_edit_notes`."""
+
+    def change(notes: str, asked: Sequence[str]) -> str:
+        if id_ not in asked:
+            raise SubmissionError(f"the report has no question {id_!r}")
+        return with_answer(notes, id_, words)
+
+    return _edit_notes(Path(folder), words, seen, change)
+
+
+def write_discussion(folder: str, words: str, seen: str, *, progress: Progress) -> dict[str, Any]:
+    """Write the discussion into `notes.md`; see `_edit_notes`."""
+    return _edit_notes(
+        Path(folder), words, seen, lambda notes, asked: with_discussion(notes, asked, words)
+    )
+
+
+def _edit_notes(
+    folder: Path, words: str, seen: str, change: Callable[[str, Sequence[str]], str]
+) -> dict[str, Any]:
+    """Change `notes.md`; return `as_typed` formulas, or the present text of a `stale` file.
 
     Parameters
     ----------
-    seen : digest of the text for which the answer was typed.
+    words : what was typed.
+    seen : digest of the text for which it was typed.
+    change : returns the new text of a text with answers to these questions.
     """
-    place = Path(folder)
-    with lock_when_free(place):
-        notes = read_notes(place)
+    with lock_when_free(folder):
+        notes = read_notes(folder)
         try:
             require_version(notes, seen, name=NOTES)
         except Stale as error:
             return {"stale": error.text}
-        if id_ not in [one["id"] for one in read_findings(place)["questions"]]:
-            raise SubmissionError(f"the report has no question {id_!r}")
-        new = with_answer(notes, id_, words)
+        new = change(notes, _asked(folder))
         if len(new.encode()) > MAX_NOTES_BYTES:
             raise SubmissionError(f"{NOTES} would exceed {MAX_NOTES_BYTES:,} bytes")
-        write_file(place / NOTES, new)
-    return {}
+        write_file(folder / NOTES, new)
+    return {"as_typed": formula_problems(words)}
+
+
+def _asked(folder: Path) -> list[str]:
+    """Return the ids of the questions of the last report."""
+    return [one["id"] for one in read_findings(folder)["questions"]]
 
 
 # -------------------------------------------------------------------- the check of reported numbers
@@ -390,4 +427,5 @@ def _find_typed(number: str, submission: Submission) -> str:
 FOLDER_TASKS = (
     read_document, students_see, read_folder, edit_file, store_files, set_aside, list_hand_in,
     pack_hand_in, describe_check, read_questions, answer_question,
+    write_discussion,
 )  # fmt: skip

@@ -7,8 +7,8 @@ from urllib.parse import urlencode
 
 from starlette.responses import Response
 
-from pipeline.desk.last_report import NOTES, PLOTS, plots_are_current, read_findings
-from pipeline.desk.page_request import PageRequest
+from pipeline.desk.last_report import NOTES, PDF, PLOTS, plots_are_current, read_findings
+from pipeline.desk.page_request import Message, PageRequest
 from pipeline.desk.student.form import sign_fields
 from pipeline.desk.student.submission_view import StalePage, SubmissionView, read_room, show_stale
 from pipeline.processes import Failed
@@ -18,10 +18,11 @@ from pipeline.words.numbers import join_names
 
 @dataclass(frozen=True, kw_only=True)
 class ReportPage:
-    """The data of the report's page; `there` says whether there is a report."""
+    """The data of the report's page: whether there is a report, and whether it has a PDF."""
 
     room: SubmissionView
     there: bool
+    pdf: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,12 +32,14 @@ class QuestionsPage:
     Attributes
     ----------
     questions : id, section, text, answer, and why the answer was refused, for each question.
+    discussion : text of the discussion, and why it was refused.
     signs : the signs of the input that one click writes, and their runs; "" for no signs.
     seen : digest of `notes.md`.
     """
 
     room: SubmissionView
     questions: Sequence[Mapping[str, str]]
+    discussion: tuple[str, str]
     signs: str
     problems: Sequence[str]
     seen: str
@@ -46,7 +49,7 @@ def show_report(ask: PageRequest) -> Response:
     """Show the report in a window below the steps."""
     folder = ask.folder()
     there = file_problem(folder, "report/report.html") is None
-    page = ReportPage(room=read_room(ask), there=there)
+    page = ReportPage(room=read_room(ask), there=there, pdf=file_problem(folder, PDF) is None)
     return ask.page("report", title=f"Report of {folder.name}", page=page)
 
 
@@ -57,17 +60,38 @@ def show_questions(ask: PageRequest) -> Response:
 
 def answer(ask: PageRequest) -> Response:
     """Write the answer to a question into `notes.md`; if it is refused, show it again as typed."""
-    folder, id_, words = ask.folder(), ask.text("id"), ask.text("answer")
+    id_, words = ask.text("id"), ask.text("answer")
     try:
-        found = ask.desk.workers.do(
-            "answer_question", folder=str(folder), id_=id_, words=words, seen=ask.text("seen")
-        )
+        found = _edit_notes(ask, "answer_question", id_=id_, words=words)
     except Failed as error:
         return _show_questions(ask, status=422, refused={id_: (words, str(error))})
+    label, place = f"Answer to {id_}", f"question-{id_}"
+    return _show_written(ask, found, label=label, words=words, place=place)
+
+
+def write_discussion(ask: PageRequest) -> Response:
+    """Write the discussion into `notes.md`; if it is refused, show it again as typed."""
+    words = ask.text("discussion")
+    try:
+        found = _edit_notes(ask, "write_discussion", words=words)
+    except Failed as error:
+        return _show_questions(ask, status=422, discussion=(words, str(error)))
+    return _show_written(ask, found, label="Discussion", words=words, place="discussion")
+
+
+def _edit_notes(ask: PageRequest, task: str, **typed: str) -> dict[str, Any]:
+    return ask.desk.workers.do(task, folder=str(ask.folder()), seen=ask.text("seen"), **typed)
+
+
+def _show_written(
+    ask: PageRequest, found: Mapping[str, Any], *, label: str, words: str, place: str
+) -> Response:
+    """Return to the form that wrote into `notes.md`, or show both versions of a changed file."""
     if "stale" in found:
-        return _show_stale(ask, NOTES, found["stale"], changed=[(f"Answer to {id_}", words, "")])
-    place = f"question-{id_}"
-    return ask.back(f"{ask.here}questions#{place}", "Written into notes.md.", place=place)
+        return _show_stale(ask, NOTES, found["stale"], changed=[(label, words, "")])
+    messages = [Message("Written into notes.md.")]
+    messages += [Message(line, "refused") for line in found["as_typed"]]
+    return ask.back(f"{ask.here}questions#{place}", *messages, place=place)
 
 
 def state_signs(ask: PageRequest) -> Response:
@@ -91,6 +115,7 @@ def _show_questions(
     *,
     status: int = 200,
     refused: Mapping[str, tuple[str, str]] = {},
+    discussion: tuple[str, str] | None = None,
     sign_error: str = "",
 ) -> Response:
     """Show the questions.
@@ -98,12 +123,14 @@ def _show_questions(
     Parameters
     ----------
     refused : by question, the typed answer and why it was refused.
+    discussion : the typed discussion and why it was refused.
     sign_error : why a sign was not written.
     """
     folder, room = ask.folder(), read_room(ask)
     findings = read_findings(folder)
     found = ask.desk.workers.do("read_questions", folder=str(folder), ids=list(refused))
-    problems = [why for _, why in refused.values()] + [sign_error] * bool(sign_error)
+    wrong = [*refused.values(), *([discussion] if discussion else [])]
+    problems = [why for _, why in wrong] + [sign_error] * bool(sign_error)
     if found["problem"]:
         problems = [found["problem"]]
     questions, known = [], [one["id"] for one in findings["questions"]]
@@ -118,11 +145,12 @@ def _show_questions(
     page = QuestionsPage(
         room=room,
         questions=questions,
+        discussion=discussion or (found["discussion"], ""),
         signs=_list_signs(room),
         problems=problems,
         seen=found["seen"],
     )
-    title = f"Questions about {folder.name}"
+    title = f"Discussion of {folder.name}"
     return ask.page("questions", status=status, title=title, page=page)
 
 

@@ -72,6 +72,11 @@ class HandInPage:
     files: Sequence[tuple[str, int]]
     authors: Sequence[str]
 
+    @property
+    def has_report(self) -> bool:
+        """Whether the report is in the zip."""
+        return any(name == last_report.PDF for name, _ in self.files)
+
 
 def show(ask: PageRequest) -> Response:
     """Show the room in its current state."""
@@ -138,8 +143,11 @@ def answer_together(ask: PageRequest) -> Response:
 
 
 def start_hand_in(ask: PageRequest) -> Response:
-    """Make the report again if a source has changed; then show the hand-in page."""
-    if not ask.sees_check and last_report.find_state(ask.folder()) != "current":
+    """Make the report again if a source has changed or it has no PDF; then show the page."""
+    folder = ask.folder()
+    is_whole = file_problem(folder, last_report.PDF) is None
+    is_current = is_whole and last_report.find_state(folder) == "current"
+    if not ask.sees_check and not is_current:
         ask.start("make_report", title="The report")
     return ask.back(f"{ask.here}hand-in")
 

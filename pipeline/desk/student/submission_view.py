@@ -23,6 +23,7 @@ from pipeline.processes import Failed
 from pipeline.results import ReportStatus
 from pipeline.submission.edit import text_digest
 from pipeline.submission.load import NAME
+from pipeline.words.numbers import count
 
 # As the page shows them. "doubt" means done, but look at it; "none" means not yet.
 State = Literal["done", "doubt", "needs", "old", "none"]
@@ -107,7 +108,7 @@ def _report(facts: StepFacts) -> Status:
     if facts.report == "current":
         return "done", "done"
     if facts.report == "answered":
-        return "done", "answers newer"
+        return "done", "texts newer"
     if facts.report == "older":
         return "old", "out of date"
     ready = all(find(facts)[0] == "done" for find in (_files, _set_up))
@@ -118,8 +119,8 @@ def _questions(facts: StepFacts) -> Status:
     if facts.report == "none":
         return "none", "not yet"
     if facts.unanswered:
-        return "needs", f"{facts.unanswered} open"
-    return "done", "done" if facts.questions else "none asked"
+        return "needs", f"{count(facts.unanswered, 'question')} open"
+    return "done", "all answered" if facts.questions else "no questions"
 
 
 def _check(facts: StepFacts) -> Status:
@@ -145,7 +146,7 @@ _STEPS: tuple[tuple[str, str, str, Callable[[StepFacts], Status]], ...] = (
     ("files", "Files", "#files", _files),
     ("set-up", "Set-up", "#details", _set_up),
     ("report", "Report", "report", _report),
-    ("questions", "Questions", "questions", _questions),
+    ("questions", "Discussion", "questions", _questions),
     ("check", "Check", "check", _check),
     ("hand-in", "Hand in", "hand-in", _hand_in),
 )

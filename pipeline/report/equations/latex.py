@@ -1,8 +1,8 @@
 """Formulas that students type in LaTeX, read into the same tree as cartlab's own formulas.
 
 latex2mathml reads the LaTeX. Only the structure and the characters of its result are used, never an
-attribute, so nothing that a student types is a link, a style or a command. What this module does
-not know is refused with the reason, and the notes then show it as typed.
+attribute, so nothing that a student types is a link, a style or a command. Unknown LaTeX is refused
+with the reason, and the notes then show it as typed.
 """
 
 import re
@@ -199,7 +199,7 @@ def _table(element: Element, depth: int) -> Term:
     width = max(map(len, rows), default=0)
     if not width:
         raise LatexError("it has an empty matrix")
-    if element.get("columnspacing"):  # of `align`: the equations stand below each other
+    if element.get("columnspacing"):  # of `align`: one equation a row
         return lines(
             row(*(part for cell in one if isinstance(cell, Math) for part in cell.parts if part))
             for one in rows

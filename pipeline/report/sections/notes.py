@@ -6,7 +6,7 @@ LaTeX between dollars is typeset; a formula that cannot be typeset is shown as t
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from urllib.parse import urlsplit
 
 from markdown_it import MarkdownIt
@@ -28,6 +28,7 @@ from pipeline.report.document import (
 from pipeline.report.equations.latex import LatexError, read_latex
 from pipeline.submission.load import COMMENT
 from pipeline.words.math import to_text
+from pipeline.words.numbers import listing
 from pipeline.words.text import Span, Spans, clean, plain
 
 _DEEPEST_HEADING = 6
@@ -39,6 +40,7 @@ _DEEPEST_NESTING = 6
 _ENDLESS = re.compile(r"\S{2000}")
 _SCHEMES = ("http", "https", "mailto")
 _FORMULAS = ("math_inline", "math_inline_double", "math_block")
+_MOST_PROBLEMS = 3  # formulas that a message lists
 _ALIGN = {"text-align:center": "c", "text-align:right": "r"}
 
 _LEAD = re.compile(r"(?:question|q|answer|a)?[\s:.#]*([\w.-]+)", re.IGNORECASE)
@@ -60,7 +62,7 @@ def note_blocks(markdown: str) -> tuple[Block, ...]:
 
 
 def formula_problems(markdown: str) -> list[str]:
-    """Return the formulas that are shown as typed, each with the reason."""
+    """Return the first formulas that are shown as typed, each with the reason."""
     found: dict[str, str] = {}
     try:
         for node in _tree(_readable(markdown)).walk():
@@ -71,7 +73,8 @@ def formula_problems(markdown: str) -> list[str]:
                     found[_as_typed(node)] = str(error)
     except RecursionError:
         return []
-    return [f"{typed} is shown as typed: {why}" for typed, why in found.items()]
+    shown = list(found.items())[:_MOST_PROBLEMS]
+    return [f"{typed} is shown as typed: {why}" for typed, why in shown]
 
 
 def _readable(markdown: str) -> str:
@@ -272,6 +275,52 @@ def with_answer(notes: str, id_: str, answer: str) -> str:
     if written_answer(new, id_) != text or any(now.get(name) != others[name] for name in others):
         raise SubmissionError(_OPEN)
     return new
+
+
+def written_discussion(notes: str, ids: Iterable[str]) -> str:
+    """Return the notes without the answers to the questions, as typed."""
+    lines, rest, after = _lines(notes), "", 0
+    for start, end in _answers(notes, ids):
+        rest += "".join(lines[after:start])
+        after = end
+    return (rest + "".join(lines[after:])).strip()
+
+
+def with_discussion(notes: str, ids: Sequence[str], discussion: str) -> str:
+    """Return the notes with a new discussion, followed by the answers to the questions.
+
+    Raises
+    ------
+    SubmissionError : the discussion has a heading with a question's id, or an unclosed code block
+        or comment would merge it with the answers.
+    """
+    text, lines = discussion.replace("\r\n", "\n").strip(), _lines(notes)
+    if taken := {named(words) for *_, words in _headings(text)} & {id_.lower() for id_ in ids}:
+        raise SubmissionError(
+            f"write the answer to {listing(sorted(taken))} into its own field, not under a heading "
+            f"of the discussion"
+        )
+    kept = ["".join(lines[start:end]).strip() for start, end in _answers(notes, ids)]
+    new = "".join(f"{part}\n\n" for part in (text, *kept) if part).rstrip() + "\n"
+    same = all(written_answer(new, id_) == written_answer(notes, id_) for id_ in ids)
+    if not same or written_discussion(new, ids) != text:
+        raise SubmissionError(_OPEN)
+    return new if new.strip() else ""
+
+
+def _answers(notes: str, ids: Iterable[str]) -> list[tuple[int, int]]:
+    """Return the first line of each answer's heading and the line after the answer."""
+    known = {id_.lower() for id_ in ids}
+    found: list[tuple[int, int]] = []
+    begun: tuple[int, int] | None = None  # line and level of the heading of an answer
+    for level, at, _, words in _headings(notes):
+        is_answer = named(words) in known
+        if begun and (is_answer or level <= begun[1]):
+            found.append((begun[0], at))
+            begun = None
+        if is_answer:
+            begun = at, level
+    return [*found, (begun[0], len(_lines(notes)))] if begun else found
 
 
 def _lines(text: str) -> list[str]:
