@@ -27,9 +27,9 @@ MathKind = Literal[
 class Math:
     """A node; `columns` is the number of columns of a matrix, whose parts are in rows.
 
-    The parts of "text" and "operator" are one string; of "accent" a base and a mark; of "root" a
-    base and a degree; of "limits" a base, a lower and an upper term; of "fenced" a bracket, a term
-    and a bracket. An empty string stands for nothing. "table" is a matrix without brackets.
+    A "text" and an "operator" have one string. An "accent" has a base and a mark, and a "root" a
+    base and a degree. "limits" has a base, an index and an exponent. "fenced" has a bracket, a term
+    and a bracket. A "table" is a matrix without brackets. An empty string is no term.
     """
 
     kind: MathKind
