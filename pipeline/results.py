@@ -606,23 +606,26 @@ CheckKind = Literal[
 ]
 
 
-@result()
+ReportState = Literal["no_model", "checks_failed", "numbers_disagree", "ok"]
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReportStatus:
     """How far the numbers of a report may be used; every page, terminal and exit code shows this.
 
     Attributes
     ----------
-    state : "no_model", or else "checks_failed", or else "numbers_disagree", or else "fine".
+    state : "no_model", or else "checks_failed", or else "numbers_disagree", or else "ok".
     count : number of failed checks, or of the students' numbers that disagree with their data.
     """
 
-    state: Literal["no_model", "checks_failed", "numbers_disagree", "fine"] = written()
-    count: int = written("failed checks, or numbers that disagree", default=0)
+    state: ReportState
+    count: int = 0
 
     @property
     def is_fine(self) -> bool:
         """Whether nothing speaks against the numbers."""
-        return self.state == "fine"
+        return self.state == "ok"
 
     @property
     def words(self) -> str:
@@ -777,6 +780,40 @@ class Finding:
             limit=self.limit,
             message=f"{self.run}: {self.reason}" if named else self.reason,
         )
+
+
+@result()
+class Subject:
+    """What a finding is about; null where it is not about one."""
+
+    experiment: str | None = written(default=None)
+    cart: int | None = written(default=None)
+    parameter: str | None = written(default=None)
+
+    @classmethod
+    def of(cls, one: "Check | Skipped") -> "Subject":
+        """Return the subject of a check or of a skipped stage."""
+        return cls(experiment=one.run or None, cart=one.cart, parameter=one.parameter or None)
+
+
+@result()
+class ListedFinding:
+    """A failed check, a skipped stage or a warning, as files list it.
+
+    Attributes
+    ----------
+    code : what is wrong. It is "skipped" for a stage, and "warning" for a warning.
+    excludes : whether the recording is used, as in `Finding`.
+    """
+
+    code: str = written()
+    about: Subject = written(default=Subject())
+    value: float | None = written(default=None)
+    limit: float | None = written(default=None)
+    message: str = written()
+    excludes: Literal["no", "odd", "wrong"] = written(
+        '"odd": differs from others, "wrong": shows something else', default="no"
+    )
 
 
 # ------------------------------------------------------------------------------------------ control
@@ -1100,15 +1137,44 @@ class Analysis:
     reported_off: tuple[str, ...] = ()
 
     @computed()
-    def status(self) -> ReportStatus:
+    def findings(self) -> tuple[ListedFinding, ...]:
+        """Everything that is wrong, open or noted, in one list."""
+        excludes = {(one.run, one.code): one.excludes for one in self.left_out}
+        checks = [
+            ListedFinding(
+                code=one.code or one.kind,
+                about=Subject.of(one),
+                value=one.value,
+                limit=one.limit,
+                message=one.message,
+                excludes=excludes.get((one.run, one.code), "no"),
+            )
+            for one in self.failed_checks
+        ]
+        skipped = [
+            ListedFinding(
+                code="skipped", about=Subject.of(one), message=f"{one.name}: {one.reason}"
+            )
+            for one in self.skipped
+        ]
+        warnings = [ListedFinding(code="warning", message=text) for text in self.warnings]
+        return (*checks, *skipped, *warnings)
+
+    @computed(key="status")
+    def state(self) -> ReportState:
         """How far the numbers may be used."""
+        return self.status.state
+
+    @property
+    def status(self) -> ReportStatus:
+        """How far the numbers may be used, in words too."""
         if self.chain is None:
             return ReportStatus(state="no_model")
         if self.failed_checks:
             return ReportStatus(state="checks_failed", count=len(self.failed_checks))
         if self.reported_off:
             return ReportStatus(state="numbers_disagree", count=len(self.reported_off))
-        return ReportStatus(state="fine")
+        return ReportStatus(state="ok")
 
     @computed()
     def provenance(self) -> Provenance:

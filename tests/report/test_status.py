@@ -12,10 +12,11 @@ import pytest
 
 from pipeline.desk.last_report import read_findings
 from pipeline.estimation.estimates import list_off
+from pipeline.json_files import json_text
 from pipeline.report.builder import Page
 from pipeline.report.document import Tiles
 from pipeline.report.sections.summary import summary
-from pipeline.results import Check
+from pipeline.results import Check, Finding, Skipped, Stage
 from pipeline.words.text import plain
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.examples import EXAMPLES
@@ -31,7 +32,7 @@ BAD = Check(kind="step", run="b", outcome="fail", message="it does not settle")
 @pytest.mark.parametrize(
     ("changes", "state", "count"),
     [
-        ({}, "fine", 0),
+        ({}, "ok", 0),
         ({"reported_off": ("K_1",)}, "numbers_disagree", 1),
         ({"reported_off": ("K_1",), "checks": (BAD, BAD)}, "checks_failed", 2),
         ({"reported_off": ("K_1",), "checks": (BAD,), "fit": None}, "no_model", 0),
@@ -70,7 +71,7 @@ def test_terminal_exit_code_files_and_desk_agree(tmp_path):
     file = folder / "submission.toml"
     text = file.read_text(encoding="utf-8")
     in_hertz = re.sub(r"(?m)^omega_n = .*$", "omega_n = 2.1", text)
-    for typed, state in ((text, "fine"), (in_hertz, "numbers_disagree")):
+    for typed, state in ((text, "ok"), (in_hertz, "numbers_disagree")):
         file.write_text(typed, encoding="utf-8")
         done = subprocess.run(
             [sys.executable, "-m", "pipeline", "report", str(folder)],
@@ -78,6 +79,23 @@ def test_terminal_exit_code_files_and_desk_agree(tmp_path):
         )  # fmt: skip
         results = json.loads((folder / "report" / "results.json").read_text(encoding="utf-8"))
         status = read_findings(folder)["status"]
-        assert results["status"]["state"] == status.state == state
-        assert done.returncode == (state != "fine")
+        assert results["status"] == status.state == state
+        assert done.returncode == (state != "ok")
         assert done.stderr.splitlines()[-1] == f"status: {status.words}"
+
+
+def test_the_file_lists_every_finding():
+    """A failed check, a skipped stage and a warning are each one entry, with code and subject."""
+    skipped = Skipped(stage=Stage.BODE_FIT, cart=2, reason="no dwells")
+    odd = Finding(code="quoted", run="b", details={"reason": "it differs"}, excludes="odd")
+    bad = replace(BAD, value=3.0, limit=1.0, code="quoted")
+    noted = replace(
+        GOOD, checks=(bad,), skipped=(skipped,), warnings=("mind the gap",), left_out=(odd,)
+    )
+    listed = json.loads(json_text(noted))["findings"]
+    nobody = {"experiment": None, "cart": None, "parameter": None}
+    assert [(one["code"], one["about"], one["value"], one["excludes"]) for one in listed] == [
+        ("quoted", nobody | {"experiment": "b"}, 3.0, "odd"),
+        ("skipped", nobody | {"cart": 2}, None, "no"),
+        ("warning", nobody, None, "no"),
+    ]
