@@ -23,7 +23,7 @@ from pipeline.cli.common import (
     progress_line,
     say,
 )
-from pipeline.errors import PipelineError
+from pipeline.errors import ConfigError, PipelineError
 from pipeline.second_process import SecondProcess
 from pipeline.words.progress import Progress
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from pipeline.report.changes import DraftChanges
     from pipeline.report.make_report import Files
     from pipeline.results import Analysis
+    from pipeline.simulated.bench import SimulatedBench
     from pipeline.submission import Submission
 
 
@@ -390,20 +391,56 @@ def simulate(
     reported: Annotated[
         bool, typer.Option("--reported", help="Add the numbers an honest student would report.")
     ] = False,
+    vary: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PERCENT", help="Draw a bench for one team, within ± PERCENT; needs --secret."
+        ),
+    ] = None,
+    secret: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The answer key: a secret, and the true values by team."),
+    ] = None,
 ) -> None:
     """Write a synthetic submission: decays, steps, sine dwells, a sweep, a closed-loop step."""
+    if (vary is None) != (secret is None):
+        raise typer.BadParameter("--vary and --secret belong together")
     from pipeline.output import new_folder
     from pipeline.simulated.hidden import prepare_bench
     from pipeline.simulated.submission import write_submission
 
     new_folder(out)
     bench = prepare_bench(preset=preset, model=model, hide=hide or ())
+    if vary is not None and secret is not None:
+        _simulate_team(out, bench, percent=vary, secret=secret, seed=seed, reported=reported)
+        return
     for sentence in bench.effect_sentences:
         say(f"hidden: {sentence}")
     with progress_line() as progress:
         progress("simulating the experiments")
         write_submission(out, bench, seed=seed, reported=reported)
     say(f"wrote {out}: try `cartlab report {out}`")
+
+
+def _simulate_team(
+    out: Path, bench: "SimulatedBench", *, percent: float, secret: Path, seed: int, reported: bool
+) -> None:
+    """Write the submission of a team, whose bench only the answer key knows."""
+    from pipeline.simulated.answer_key import changing_key, draw_bench
+    from pipeline.simulated.submission import Students, write_submission
+
+    team = out.resolve().name
+    if secret.resolve().is_relative_to(out.resolve()):
+        raise ConfigError(f"--secret {secret}: is in the team's folder; students would read it")
+    with changing_key(secret) as key, progress_line() as progress:
+        rng = key.generator(team, seed=seed)
+        own, answers = draw_bench(bench, percent=percent, rng=rng)
+        progress("simulating the experiments")
+        noise = int(rng.integers(2**63))
+        students = Students(title="Identification of carts on springs", is_anonymous=True)
+        write_submission(out, own, seed=noise, reported=reported, students=students)
+        key.teams[team] = answers
+    say(f"wrote {out}, and its true values to {secret}")
 
 
 @app.command()

@@ -205,6 +205,7 @@ class Students:
         two teams share one.
     title : title of the submission. By default it names the bench and the seed.
     springs : whether they declare each spring as present. By default, they state the true springs.
+    is_anonymous : whether nobody is named; the students then enter themselves.
     time_decimals : decimals of the log's time stamps. With 3, they are rounded as in an ECP export.
     """
 
@@ -213,6 +214,7 @@ class Students:
     section: str = "01"
     springs: Sequence[bool] = ()
     time_decimals: int = 5
+    is_anonymous: bool = False
 
 
 def write_submission(
@@ -318,7 +320,8 @@ def _head(bench: SimulatedBench, students: Students, *, seed: int) -> Iterator[s
     named = f"Simulated bench, {bench.name}, seed {seed}" if bench.name else "Simulated bench"
     title = students.title or named
     yield toml_section("", {"version": 1, "title": title, "section": students.section})
-    for author in students.authors or (f"s{1001 + 2 * seed}", f"s{1002 + 2 * seed}"):
+    nobody = () if students.is_anonymous else (f"s{1001 + 2 * seed}", f"s{1002 + 2 * seed}")
+    for author in students.authors or nobody:
         yield toml_section("[[authors]]", {"id": author})
     system: dict[str, Value] = {
         "carts": bench.chain.n,

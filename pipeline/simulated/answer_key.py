@@ -1,0 +1,134 @@
+"""Benches that are drawn for one team each, and the answer key with their true values.
+
+The draw depends on a secret in the key, so that nobody can repeat it without the key.
+"""
+
+import hashlib
+import json
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from pipeline.errors import ConfigError, DataError
+from pipeline.json_files import json_text, result, written
+from pipeline.lock import lock_when_free
+from pipeline.output import write_file
+from pipeline.plant.chain import Chain
+from pipeline.plant.effect import EffectTerm
+from pipeline.simulated.bench import SimulatedBench
+from pipeline.submission.toml import read_text
+
+MOST_PERCENT = 50.0  # a larger change may exchange the order of resonances
+_MOST_BYTES = 10_000_000
+
+
+@result(eq=False)
+class TeamBench:
+    """The bench of a team.
+
+    Attributes
+    ----------
+    parameters : the true values of the report's parameters.
+    """
+
+    chain: Chain = written()
+    effects: tuple[EffectTerm, ...] = written(default=())
+    parameters: dict[str, float] = written("true values of the report's parameters")
+
+
+@result(eq=False)
+class AnswerKey:
+    """A secret, and the bench that was drawn for each team, by the name of its folder."""
+
+    schema: Literal["cartlab-key/1"] = written(default_factory=lambda: "cartlab-key/1")
+    secret: str = written("anybody who knows it can draw the same benches")
+    teams: dict[str, TeamBench] = written()
+
+    def generator(self, team: str, *, seed: int) -> np.random.Generator:
+        """Return the random numbers of a team."""
+        drawn = hashlib.sha256(f"{self.secret}\0{team}\0{seed}".encode()).digest()
+        return np.random.default_rng(int.from_bytes(drawn, "big"))
+
+
+@contextmanager
+def changing_key(path: Path) -> Iterator[AnswerKey]:
+    """Open an answer key, new or not, and write it again at the end, for its owner only.
+
+    Raises
+    ------
+    ConfigError : the file is not an answer key.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with lock_when_free(path.parent):
+        key = read_key(path) if path.exists() else AnswerKey(secret=secrets.token_hex(16), teams={})
+        yield key
+        write_file(path, json_text(key), private=True)
+
+
+def read_key(path: Path) -> AnswerKey:
+    """Return an answer key.
+
+    Raises
+    ------
+    ConfigError : the file is not an answer key.
+    """
+    try:
+        found = json.loads(read_text(path, where=str(path), limit=_MOST_BYTES, error=ConfigError))
+        return TypeAdapter(AnswerKey).validate_python(found)
+    except (ValidationError, ValueError, RecursionError):
+        raise ConfigError(
+            f"{path}: is not an answer key; give the file that an earlier `simulate --vary` "
+            "wrote, or a new one"
+        ) from None
+
+
+def draw_bench(
+    bench: SimulatedBench, *, percent: float, rng: np.random.Generator
+) -> tuple[SimulatedBench, TeamBench]:
+    """Return a bench with drawn masses, dampings, springs and effects, and its true values.
+
+    Each mass, damping and spring is multiplied by a factor between 1 - percent/100 and
+    1 + percent/100. An effect has one factor, which scales its distance from no effect. So its
+    values stay possible together.
+
+    Raises
+    ------
+    ConfigError : the percentage is not above 0, or is too large.
+    """
+    if not 0 < percent <= MOST_PERCENT:
+        raise ConfigError(f"--vary {percent:g}: give a percentage up to {MOST_PERCENT:g}")
+    share, chain = percent / 100, bench.chain
+
+    def factors(n: int) -> np.ndarray:
+        return rng.uniform(1 - share, 1 + share, size=n)
+
+    drawn = Chain(
+        m=chain.m * factors(chain.m.size),
+        c=chain.c * factors(chain.c.size),
+        k=chain.k * factors(chain.k.size),
+    )
+    effects = tuple(_scaled(term, float(factors(1)[0])) for term in bench.effects)
+    try:
+        parameters = drawn.parameters()
+    except DataError:  # no spring to a wall, so there are no static gains
+        parameters = {}
+    own = replace(bench, chain=drawn, effects=effects, effect_sentences=(), name="")
+    return own, TeamBench(chain=drawn, effects=effects, parameters=parameters)
+
+
+def _scaled(term: EffectTerm, factor: float) -> EffectTerm:
+    values = [
+        value if not parameter.reported else _moved(value, parameter.neutral or 0.0, factor)
+        for parameter, value in zip(term.effect.parameters, term.values, strict=True)
+    ]
+    return replace(term, values=tuple(values))
+
+
+def _moved(value: float, neutral: float, factor: float) -> float:
+    return neutral + factor * (value - neutral)
