@@ -784,7 +784,7 @@ class Finding:
 
 @result()
 class Subject:
-    """What a finding is about; null where it is not about one."""
+    """What a finding is about; null for what does not apply."""
 
     experiment: str | None = written(default=None)
     cart: int | None = written(default=None)
