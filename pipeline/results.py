@@ -784,7 +784,7 @@ class Finding:
 
 @result()
 class Subject:
-    """What a finding is about; null for what does not apply."""
+    """The recording, cart or parameter of a finding; null if it has none."""
 
     experiment: str | None = written(default=None)
     cart: int | None = written(default=None)
