@@ -784,7 +784,7 @@ class Finding:
 
 @result()
 class Subject:
-    """The recording, cart or parameter of a finding; null if it has none."""
+    """The recording, cart and parameter of a finding, or null."""
 
     experiment: str | None = written(default=None)
     cart: int | None = written(default=None)
