@@ -888,6 +888,7 @@ class HardwareCheck:
     effort : (n,) input of the simulated loop; None in the comparison with the measured input.
     set_point : (n,) desired position of this cart; None if the loop controls another cart.
     contradicted : whether the log or the stated controller must be wrong; the note says why.
+    is_scaled : whether the model is driven by the logged input times `input_scale`.
     """
 
     experiment: str = written()
@@ -911,6 +912,7 @@ class HardwareCheck:
     measured: Array
     model: Array
     contradicted: bool = False
+    is_scaled: bool = False
     effort: Array | None = None
     set_point: Array | None = None
 

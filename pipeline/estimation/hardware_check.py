@@ -566,6 +566,7 @@ def _compare(
                 model=model,
                 note=note,
                 contradicted=simulated.contradicted,
+                is_scaled=simulated.factor != 1.0,
                 effort=simulated.u,
                 set_point=followed if cart == steered else None,
             )

@@ -149,7 +149,9 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
     others = [name for name, found in data.signs.found.items() if found == -sign]
     wrong = next((check.message for check in failed if check.kind == "input"), "")
     but = f"; the opposite sign is shown by {join_names(others)}" if others else ""
-    shown = f"shown by {join_names(shown_by)}{but}" if shown_by else ""
+    unseen = [r.id for r in driven if not stated and not data.signs.found.get(r.id)]
+    taken = f"; taken over for {join_names(unseen)}, which do not show it" if unseen else ""
+    shown = f"shown by {join_names(shown_by)}{but}{taken}" if shown_by else ""
     support, reason = _judge(wrong=wrong, shown=shown, unknown="no recording shows it")
     yield Assumption(
         key="system.input.sign",

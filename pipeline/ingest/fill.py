@@ -223,7 +223,8 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
     if new:
         # Exports may also have columns for carts that the bench lacks.
         carts = {cart for f in looked if (i := f.inspection) for cart in i.moving or i.positions}
-        write_templates(folder, carts=max((n for n in carts if n <= MOST_CARTS), default=1))
+        most = max((n for n in carts if n <= MOST_CARTS), default=1)
+        write_templates(folder, carts=most, examples=False)
     found: list[Found] = []
 
     def change(document: tomlkit.TOMLDocument) -> None:

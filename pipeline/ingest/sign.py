@@ -89,25 +89,16 @@ def with_signs(
 def _say_signs(
     driven: list[str], *, stated: dict[str, int], found: dict[str, int], signs: dict[str, int]
 ) -> list[str]:
-    """Return notes on which signs were found, and which were only assumed."""
-    searched = [name for name in driven if name not in stated]
-    if not searched:
-        return []
-    if not any(found.get(name) for name in searched):
-        return [
-            "the data do not show the sign of the input: it is assumed to be "
-            f"{signs[searched[0]]:+d}; state it if this is wrong"
-        ]
+    """Return a warning if the data show different signs; one sign for all is an assumption."""
+    searched = [name for name in driven if name not in stated and found.get(name)]
     usual = 1 if sum(signs[name] for name in searched) >= 0 else -1
-    text = f"sign of the input found from the data: {usual:+d}"
-    if others := [name for name in searched if signs[name] != usual]:
-        text += f", but {-usual:+d} in {join_names(others, most=FEW_NAMES)}"
-    if unsure := [name for name in searched if not found.get(name)]:
-        text += (
-            f"; the data of {join_names(unsure, most=FEW_NAMES)} do not show it, so it is taken "
-            "from the other recordings"
-        )
-    return [text]
+    others = [name for name in searched if signs[name] != usual]
+    if not others:
+        return []
+    return [
+        f"the data show the sign {-usual:+d} of the input in {join_names(others, most=FEW_NAMES)}, "
+        f"but {usual:+d} in the other recordings; each is used here with its own sign"
+    ]
 
 
 # --------------------------------------------------------- signs from the data

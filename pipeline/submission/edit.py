@@ -168,7 +168,7 @@ def toml_item(value: Value) -> Any:
 
 # --------------------------------------------------------------------------------- a new submission
 
-_NOTES = """\
+NOTES_TEMPLATE = """\
 <!-- What you write here becomes the discussion of the report (Markdown). Comments like this do not.
 
      `cartlab report` asks the questions that your data raise, for example about zeta_b. Answer
@@ -177,7 +177,8 @@ _NOTES = """\
      ## zeta_b
      The decay saw …
 
-     Everything else is free text: what limits the model? What would you record next? -->
+     Everything else is free text: what limits the model? What would you record next?
+     LaTeX between dollars becomes a formula: $\\zeta_b$. -->
 """
 
 
@@ -196,10 +197,14 @@ def new_submission(folder: Path, *, carts: int) -> None:
     write_templates(folder, carts=carts)
 
 
-def write_templates(folder: Path, *, carts: int) -> None:
+def write_templates(folder: Path, *, carts: int, examples: bool = True) -> None:
     """Write the files of `new_submission` into a folder that may already hold recordings.
 
     An existing `submission.toml` or `notes.md` stays as it is.
+
+    Parameters
+    ----------
+    examples : whether all keys stand in the file as comments, instead of a link to them.
     """
     # Imported late, because this takes 50 ms.
     import jinja2
@@ -213,6 +218,7 @@ def write_templates(folder: Path, *, carts: int) -> None:
     )
     text = environment.from_string(source).render(
         carts=carts,
+        examples=examples,
         springs=["true"] * (carts + 1),
         spring_names=spring_names(carts),
         ratio_names=[f"x{i}" for i in range(1, carts + 1)],
@@ -220,6 +226,6 @@ def write_templates(folder: Path, *, carts: int) -> None:
         names=parameter_names(carts),
     )
     (folder / "data").mkdir(parents=True, exist_ok=True)
-    for name, content in ((NAME, text), ("notes.md", _NOTES)):
+    for name, content in ((NAME, text), ("notes.md", NOTES_TEMPLATE)):
         if not (folder / name).exists():
             write_file(folder / name, content)

@@ -67,7 +67,8 @@ def test_a_folder_of_files_becomes_a_submission(tmp_path):
     }  # fmt: skip
     assert [len(doubts) for doubts in experiment_doubts(tmp_path)] == [1, 0, 0, 0]
     text = (tmp_path / "submission.toml").read_text(encoding="utf-8")
-    assert "#[design]" in text  # a comment of the file that `cartlab new` writes
+    assert "docs/submission.md" in text  # instead of the examples that `cartlab new` writes
+    assert not re.search(r"^#\[(design|\[experiments|reported)", text, re.MULTILINE)
     assert len(read_data(submission).records) == 4
 
 

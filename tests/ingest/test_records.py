@@ -403,14 +403,16 @@ def test_a_stated_reference_replaces_that_of_the_file(tmp_path):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_an_unstated_sign_is_found_and_reported(sign, tmp_path):
-    """If no sign is stated, the data decide it, so that positive input pushes to positive x."""
+def test_an_unstated_sign_is_found(sign, tmp_path):
+    """If no sign is stated, the data decide it, so that positive input pushes to positive x.
+
+    This is an assumption and no warning.
+    """
     data = read(tmp_path, "", STEP, csv(time=T, input=sign * U, x1=X1))
     assert_array_equal(data.records[0].u, U)
     assert data.records[0].input_scale == sign
     assert (data.signs.stated, data.signs.found) == ({}, {"a": sign})
-    (said,) = data.warnings
-    assert said.endswith(f"{sign:+d}")
+    assert data.warnings == ()
 
 
 def test_a_stated_sign_is_used_and_a_doubtful_one_reported(tmp_path):
@@ -462,17 +464,17 @@ def test_signs_may_differ_between_experiments(tmp_path):
         "step": -1, "loop": 1,
     }  # fmt: skip
     (said,) = data.warnings
-    assert re.findall(r"[+-]1\b|\bstep\b|\bblind\b", said) == ["+1", "-1", "step", "blind"]
+    assert re.findall(r"[+-]1\b|\bstep\b|\bblind\b", said) == ["-1", "step", "+1"]
     assert list(data.files) == sorted(f"{name}.csv" for name in runs)
 
 
-def test_data_that_do_not_show_the_sign_are_reported(tmp_path):
-    """If cart 1 is not measured, the input's sign is taken as +1, and a note says so."""
+def test_a_sign_that_the_data_do_not_show_is_assumed(tmp_path):
+    """If cart 1 is not measured, the input's sign is taken as +1: an assumption, no warning."""
     data = read(tmp_path, "", STEP, csv(time=T, input=U, x2=X2))
     assert_array_equal(data.records[0].u, U)
     assert not any(data.signs.found.values())
     assert data.records[0].input_scale == 1.0
-    assert "+1" in data.warnings[0]
+    assert data.warnings == ()
 
 
 def test_a_dwell_carries_its_frequency(tmp_path):

@@ -21,6 +21,7 @@ from pipeline.submission import (
 from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import InvalidSubmission
 from pipeline.submission.toml import nearest, quote
+from tests.helpers.places import ROOT
 
 FULL = """\
 version = 1
@@ -316,6 +317,23 @@ def test_every_commented_key_of_a_new_submission_is_valid(carts, tmp_path):
     assert submission.reported is not None
     assert list(submission.reported.final) == parameter_names(carts)
     assert submission.design is not None
+
+
+def test_the_examples_of_the_documentation_are_valid(tmp_path):
+    """The examples to copy in docs/submission.md make one valid submission with every kind."""
+    page = (ROOT / "docs" / "submission.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^## Examples to copy$.*?^```toml\n(.*?)^```", page, re.DOTALL | re.M)
+    text = f"version = 1\n[system]\ncarts = 2\n{block}"
+    (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "data").mkdir()
+    for name in re.findall(r'^file = "(.*)"', text, flags=re.MULTILINE):
+        (tmp_path / name).write_text("time,x1\n", encoding="utf-8")
+
+    submission = load_submission(tmp_path)
+
+    kinds = {experiment.kind for experiment in submission.experiments}
+    assert kinds == {"decay", "step", "sine", "sweep", "bode", "closed_loop"}
+    assert not submission.unread
 
 
 def test_a_new_submission_overwrites_nothing(tmp_path):

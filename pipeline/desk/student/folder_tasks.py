@@ -47,6 +47,7 @@ from pipeline.report.sections.notes import (
 )
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.edit import (
+    NOTES_TEMPLATE,
     Stale,
     edit_submission,
     require_version,
@@ -285,9 +286,10 @@ def read_questions(folder: str, ids: Sequence[str], *, progress: Progress) -> di
     except SubmissionError as error:
         problem = str(error)
     known = _asked(Path(folder))
+    discussion = written_discussion(notes, known)
     return {
         "answers": {id_: written_answer(notes, id_) for id_ in [*known, *ids]},
-        "discussion": written_discussion(notes, known),
+        "discussion": "" if discussion == NOTES_TEMPLATE.strip() else discussion,
         "seen": text_digest(notes),
         "problem": problem,
     }

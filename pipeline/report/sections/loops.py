@@ -154,8 +154,13 @@ def hardware_blocks(page: Page) -> list[Block]:
             "left": percent(100 * worst.nrmse),
         }
         blocks.append(page.picture(f"hardware-{i}", figure, _WORDS, "hardware", **said))
+    scaled = {check.experiment for check in checks if check.is_scaled}
     scales = [
-        _WORDS.text("input_scale", run=c.experiment, scale=significant(c.input_scale, digits=3))
+        _WORDS.text(
+            "input_scaled" if c.experiment in scaled else "input_scale",
+            run=c.experiment,
+            scale=significant(c.input_scale, digits=3),
+        )
         for c in checks
         # A difference below 5 % is not worth mentioning.
         if c.input_scale is not None and abs(c.input_scale - 1) > 0.05
