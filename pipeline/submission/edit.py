@@ -204,7 +204,7 @@ def write_templates(folder: Path, *, carts: int, examples: bool = True) -> None:
 
     Parameters
     ----------
-    examples : whether all keys stand in the file as comments, instead of a link to them.
+    examples : whether to write all keys as comments, instead of a link to the documentation.
     """
     # Imported late, because this takes 50 ms.
     import jinja2

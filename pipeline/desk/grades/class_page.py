@@ -113,11 +113,11 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
 
 
 def show_clean(ask: PageRequest) -> Response:
-    """Show the list of teams that can be accepted together: no remark, and not yet reviewed."""
+    """Show the list of teams that can be accepted together: no flag, and not yet reviewed."""
     shown = ask.class_view
     return ask.page(
         "clean",
-        title="Teams without a remark",
+        title="Teams without a flag",
         teams=[one for one in Filter(seen="no").chosen(shown) if not one.grade.in_doubt],
         points=points_text,
         titles={id_: capital(title) for id_, title in shown.rubric.titles.items()},
@@ -291,7 +291,7 @@ def release(ask: PageRequest) -> Response:
         )
     released = ask.text("do") == "release"
     ask.gradebook.release(released, by=ask.sign())
-    message = "Students can read their feedback." if released else "Students can no longer read it."
+    message = "The grades are published." if released else "The grades are no longer published."
     return ask.back(f"{ask.here}#work", message)
 
 

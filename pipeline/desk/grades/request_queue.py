@@ -73,7 +73,7 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
     return ask.page(
         "requests",
         status=status,
-        title="Another look",
+        title="Regrade requests",
         of=of,
         own=_write_address(ask, of),
         waiting=waiting,

@@ -15,7 +15,7 @@ _STATES: Mapping[str, tuple[str, Callable[[Entry], bool]]] = {
     "late": ("late", lambda team: team.grade.days_late > 0),
     "hand": ("changed by hand", lambda team: bool(team.grade.by_hand)),
     "open": ("not final", lambda team: bool(team.grade.open)),
-    "remark": ("with a remark", lambda team: bool(team.grade.codes)),
+    "remark": ("with a flag", lambda team: bool(team.grade.codes)),
 }
 _SEEN = {"no": "not yet reviewed", "yes": "reviewed"}
 _ORDERS = {
@@ -121,7 +121,7 @@ class Filter:
         by_state = {key: sum(map(test, teams)) for key, (_, test) in _STATES.items()}
         remarks = {c: f"{WORDS.text(f'title_{c}')} ({flags[c]})" for c in common}
         return [
-            _choice("flag", "Remark", remarks, self.flag),
+            _choice("flag", "Flag", remarks, self.flag),
             _choice("lost", "Points lost in", {c: f"{titles[c]} ({n})" for c, n in lost.items()},
                     self.lost),
             _choice("state", "State", {k: f"{_STATES[k][0]} ({n})" for k, n in by_state.items()},

@@ -87,7 +87,7 @@ def show_whole(ask: PageRequest) -> Response:
     """Show the complete feedback page of the team, with its figures."""
     own, found = _find_own(ask), _read(ask)
     if found is None:
-        raise HTTPException(404, "your feedback is not published yet")
+        raise HTTPException(404, "your grades are not published yet")
     seen = view(found, "team", see=ask.user.see)
     if seen.hides_numbers:
         raise HTTPException(403, REFUSED)

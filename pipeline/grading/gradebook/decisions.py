@@ -253,7 +253,7 @@ def ask(entry: Entry, criterion: str, *, why: str) -> Event:
     text = _read_words(why, wanted="write what was judged wrongly, and why")
     known = entry.requests.get(criterion)
     if known is not None and known.state != "reopened":
-        raise RequestRefused("you asked for another look at this criterion already")
+        raise RequestRefused("you sent a regrade request for this criterion already")
     if criterion not in points_lost(entry.grade, entry.rubric):
         raise RequestRefused("you can ask only where points were lost")
     if sum(one.state == "asked" for one in entry.requests.values()) >= MOST_OPEN:

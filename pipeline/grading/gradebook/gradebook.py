@@ -933,7 +933,7 @@ def _check_version(entry: Entry, wanted: WantedPoints) -> None:
 
 def _check_request(entry: Entry, criterion: str, version: str) -> None:
     if criterion not in entry.requests:
-        raise ConfigError(f"{criterion}: nobody asked for another look")
+        raise ConfigError(f"{criterion}: nobody sent a regrade request")
     if version != entry.request_version(criterion):
         raise Conflict(
             f"{criterion}: was changed after this page was shown", now=entry.given.get(criterion)

@@ -95,7 +95,7 @@ def _board(grades: Sequence[Grade], points: "pd.Series", rubric: Rubric) -> list
         tiles += [
             Tile(spans(f"Mean{of}"), spans(f"{points.mean():.2f} of {out_of}")),
             Tile(spans(f"Median{of}"), spans(f"{points.median():.2f} of {out_of}")),
-            Tile(spans("With a remark"), spans(str(remarks)), url="#mistakes"),
+            Tile(spans("With a flag"), spans(str(remarks)), url="#mistakes"),
         ]
     return [Tiles(tuple(tiles))]
 

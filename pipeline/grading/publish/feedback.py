@@ -103,7 +103,7 @@ def _summary(view: GradeView) -> list[Block]:
         ),
         Tile(
             spans("To look at"),
-            spans(counted(len(grade.flags), "remark") if grade.flags else "nothing"),
+            spans(counted(len(grade.flags), "flag") if grade.flags else "nothing"),
             tone="" if grade.flags else "good",
             url="#remarks" if grade.flags else "",
         ),
