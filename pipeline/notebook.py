@@ -1,18 +1,19 @@
 """Analyses for a notebook: one call each, with results as pandas and control objects."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
 
 from pipeline.errors import ConfigError, DataError
 from pipeline.gap.types import Gap
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.self_check.answers import CheckAnswer, answer_lines
 from pipeline.grading.self_check.check import check_numbers
-from pipeline.plant.chain import Chain
-from pipeline.plant.margins import closed_loop
+from pipeline.plant.margins import closed_loop, stability_margins
 from pipeline.plant.motion import EquationsOfMotion
 from pipeline.report import gap_tables, tables
 from pipeline.report.document import Block, Document, Heading
@@ -22,7 +23,7 @@ from pipeline.report.html import render_fragment
 from pipeline.report.lab_report import build_document
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
-from pipeline.results import Analysis, FeedbackDesign
+from pipeline.results import Analysis, ChainWithUnits, FeedbackDesign
 from pipeline.submission import load_submission
 from pipeline.submission.load import with_reported
 from pipeline.words.progress import silent
@@ -34,6 +35,40 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _AT_A_GLANCE = ("summary", "parameters")
+T = TypeVar("T")
+
+
+class Named(dict[str, T]):
+    """A dictionary that answers a wrong name with all names."""
+
+    def __missing__(self, name: object) -> T:
+        """Refuse an unknown name."""
+        raise KeyError(f"there is no {name!r}; there are {', '.join(self) or 'none'}")
+
+
+class Records(Named["pd.DataFrame"]):
+    """The measured data by experiment; a notebook cell displays the list of recordings."""
+
+    @property
+    def _shown(self) -> "pd.DataFrame":
+        import pandas as pd
+
+        rows = {
+            name: {
+                "kind": frame.attrs["kind"],
+                "samples": len(frame),
+                "duration [s]": round(float(np.ptp(frame.index)), 3),
+                "columns": ", ".join(f"{c} [{frame.attrs['units'][c]}]" for c in frame.columns),
+            }
+            for name, frame in self.items()
+        }
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+    def __repr__(self) -> str:
+        return self._shown.to_string()
+
+    def _repr_html_(self) -> str:
+        return self._shown.to_html()
 
 
 @dataclass(frozen=True)
@@ -64,19 +99,20 @@ class Lab:
 
     # ----------------------------------------------------------------- systems
 
-    @property
-    def chain(self) -> Chain:
+    @cached_property
+    def chain(self) -> ChainWithUnits:
         """The identified masses, dampings and springs.
 
         Raises
         ------
         DataError : the carts could not be identified; the message gives the reasons.
         """
-        if self.results.chain is None:
+        chain = self.results.chain_with_units
+        if chain is None:
             raise DataError(f"the carts were not identified: {self._reasons}")
-        return self.results.chain
+        return chain
 
-    @property
+    @cached_property
     def design(self) -> FeedbackDesign:
         """The designed state feedback: gains, prefilter, margins, …
 
@@ -86,7 +122,7 @@ class Lab:
         """
         if self.results.feedback is None:
             raise DataError(f"no feedback was designed: {self._reasons}")
-        return self.results.feedback
+        return replace(self.results.feedback, units=self.results.bench.units)
 
     @property
     def _reasons(self) -> str:
@@ -102,12 +138,38 @@ class Lab:
         """The transfer function from `u` to each output, by the output's name."""
         import control
 
-        return {
-            name: control.TransferFunction(
-                *self.chain.transfer_function(cart), inputs=["u"], outputs=[name], name=name
+        return Named(
+            (
+                name,
+                control.TransferFunction(
+                    *self.chain.transfer_function(cart), inputs=["u"], outputs=[name], name=name
+                ),
             )
             for cart, name in enumerate(self.system.output_labels, start=1)
-        }
+        )
+
+    @cached_property
+    def frd(self) -> "dict[str, control.FrequencyResponseData]":
+        """The measured frequency response from `u` to each output, by the output's name.
+
+        A table of amplitude ratios has no phases, so it is only in `frequency_response`.
+        """
+        import control
+
+        return Named(
+            (
+                f"x{measured.cart}",
+                control.FrequencyResponseData(
+                    measured.magnitude * np.exp(1j * measured.phase),
+                    measured.omega,
+                    inputs=["u"],
+                    outputs=[f"x{measured.cart}"],
+                    name=f"x{measured.cart}",
+                ),
+            )
+            for measured in self.results.frequency_responses
+            if measured.phase is not None
+        )
 
     @cached_property
     def closed_loop(self) -> "control.StateSpace":
@@ -117,6 +179,14 @@ class Lab:
         """
         controller = self.design.controller(self.chain)
         return closed_loop(self.chain, controller, sample_time=self.design.sample_time)
+
+    def stability_margins(self) -> tuple[float, float, float, float, float, float]:
+        """Return gm, pm, sm, wpc, wgc, wms of the designed loop, cut at the motor.
+
+        They mean the same as those of `control.stability_margins`.
+        """
+        controller = self.design.controller(self.chain)
+        return stability_margins(self.chain, controller, sample_time=self.design.sample_time)
 
     # ------------------------------------------------------------------ tables
 
@@ -154,14 +224,14 @@ class Lab:
     def records(self) -> "dict[str, pd.DataFrame]":
         """The measured data by experiment, as tables with index `time` and columns `u`, `x1`, …"""
         records = self.results.records
-        return {r.id: tables.record_frame(r, analysis=self.results) for r in records}
+        return Records((r.id, tables.record_frame(r, analysis=self.results)) for r in records)
 
     # ------------------------------------------------------------------ report
 
     @property
     def questions(self) -> dict[str, str]:
         """The questions that the data raise, by the id that `notes.md` uses for the answer."""
-        return {question.id: with_symbols(question.text) for question in ask(self.results)}
+        return Named((one.id, with_symbols(one.text)) for one in ask(self.results))
 
     @property
     def sections(self) -> tuple[str, ...]:

@@ -52,7 +52,9 @@ from pipeline.plant.chain import Chain
 from pipeline.plant.margins import Margins
 from pipeline.plant.sampled_loop import StateFeedback
 from pipeline.setup import Setup, Units
+from pipeline.words.numbers import percent, significant
 from pipeline.words.phrases import phrases
+from pipeline.words.quantities import Quantity, quantity_html, quantity_lines
 
 ExperimentKind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
 Hold = Literal["zero_order", "band_limited"]
@@ -826,6 +828,7 @@ class FeedbackDesign:
     Attributes
     ----------
     t, y (n_carts, n), u : the simulated step.
+    units : of the table that a notebook shows.
     """
 
     cart: int = written()
@@ -860,10 +863,49 @@ class FeedbackDesign:
     t: Array
     y: Array
     u: Array
+    units: Units = Units(position="position unit", input="input unit")
+
+    def quantities(self) -> list[Quantity]:
+        """Return gains, prefilter, and the properties of the simulated step."""
+        position, drive = self.units.position, self.units.input
+        rows = []
+        for i, value in enumerate(self.gains):
+            of, unit = ("velocity", f"{drive} s") if i % 2 else ("position", drive)
+            name = f"gain on the {of} of cart {i // 2 + 1}"
+            rows.append((name, significant(value), f"{unit}/{position}"))
+        if self.R is not None:
+            rows.append(("LQR weight of the input, R", significant(self.R), f"{position}/{drive}"))
+        return [
+            *rows,
+            ("prefilter", significant(self.prefilter), f"{drive}/{position}"),
+            ("sample time T", significant(self.sample_time, digits=5), "s"),
+            ("delay of the effort", "1", "sample"),
+            ("overshoot", percent(self.overshoot_percent), ""),
+            ("settling time, 2 %", significant(self.settling_time, digits=3), "s"),
+            ("largest input", significant(self.peak_input, digits=3), drive),
+        ]
 
     def controller(self, chain: Chain | None) -> StateFeedback:
         """Return the controller; its observer predicts with the chain or, as the bench, without."""
         return StateFeedback(gains=self.gains, prefilter=self.prefilter, model=chain)
+
+    @property
+    def _shown(self) -> tuple[str, list[Quantity]]:
+        rows = self.quantities()
+        if self.margins is not None:
+            gain, phase = self.margins.gain, self.margins.phase_deg
+            rows += [
+                ("gain margin", significant(gain, digits=3), ""),
+                ("phase margin", significant(phase, digits=3), "°"),
+                ("modulus margin", significant(self.margins.modulus, digits=3), ""),
+            ]
+        return f"State feedback for cart {self.cart}", rows
+
+    def __repr__(self) -> str:
+        return quantity_lines(*self._shown)
+
+    def _repr_html_(self) -> str:
+        return quantity_html(*self._shown)
 
 
 @result()
@@ -1031,6 +1073,26 @@ class ChainWithUnits(Chain):
         """Return the chain together with its units."""
         own = ChainUnits(m=units.mass, c=units.damping, k=units.stiffness)
         return cls(m=chain.m, c=chain.c, k=chain.k, units=own)
+
+    @property
+    def _shown(self) -> tuple[str, list[Quantity]]:
+        springs = self.k[:1] if self.n == 1 else self.k  # on one cart, only their sum is known
+        rows = [
+            (f"{letter}_{i}", significant(float(value)), unit)
+            for letter, values, unit in (
+                ("m", self.m, self.units.m),
+                ("c", self.c, self.units.c),
+                ("k", springs, self.units.k),
+            )
+            for i, value in enumerate(values, start=1)
+        ]
+        return "Masses m, dampings c, springs k", rows
+
+    def __repr__(self) -> str:
+        return quantity_lines(*self._shown)
+
+    def _repr_html_(self) -> str:
+        return quantity_html(*self._shown)
 
 
 @result(eq=False)

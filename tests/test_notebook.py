@@ -7,7 +7,9 @@ import ast
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
+import control
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from pipeline.json_files import json_text, plain
 from pipeline.notebook import Lab, analyse
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.resources import EXAMPLES
+from pipeline.setup import Units
 from tests.helpers.examples import analysed
 from tests.helpers.pages import Page
 from tests.helpers.places import ROOT
@@ -116,6 +119,66 @@ def test_records_are_tables_by_time(lab):
     assert run.attrs["units"] == {
         "time": "s", "u": "V", "reference": "cm", "x1": "cm", "x2": "cm"
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "units"),
+    [("chain", {"V s²/cm", "V s/cm", "V/cm"}), ("design", {"V/cm", "V s/cm", "s", "V", "°"})],
+)
+def test_a_result_displays_as_a_table_with_units(lab, name, units):
+    """Carts and design show one row per number, with its unit, as HTML and as text."""
+    shown = getattr(lab, name)
+    page = Page(shown._repr_html_())
+    rows = [tag for tag, _ in page.tags].count("tr")
+    assert rows == len(repr(shown).splitlines()) - 1 > 6
+    for text in (page.text, repr(shown)):
+        plain = text.replace("\u00a0", " ")
+        assert all(unit in plain for unit in units)
+    first = lab.chain.m[0] / 1e-4 if name == "chain" else lab.design.gains[0]
+    assert f"{first:.4g}" in page.text
+
+
+def test_units_in_a_table_are_escaped(lab):
+    """A unit may be any text; in the HTML it is never markup."""
+    odd = replace(lab.design, units=Units(position="<b>", input="V"))
+    assert "<b>" not in odd._repr_html_()
+    assert "<b>" in repr(odd)
+
+
+def test_the_list_of_recordings_names_columns_and_units(lab):
+    """`lab.records` displays one row per recording; it remains a dictionary."""
+    page = Page(lab.records._repr_html_())
+    for text in (page.text, repr(lab.records)):
+        assert all(name in text for name in lab.records)
+        assert "reference [cm]" in text
+    assert isinstance(lab.records, dict)
+
+
+@pytest.mark.parametrize("table", ["records", "transfer_functions", "frd", "questions"])
+def test_a_wrong_name_is_answered_with_the_right_ones(lab, table):
+    """A KeyError lists the names that exist."""
+    with pytest.raises(KeyError) as error:
+        getattr(lab, table)["nothing"]
+    assert all(name in str(error.value) for name in getattr(lab, table))
+
+
+def test_the_measured_frequency_response_is_python_controls(lab):
+    """`lab.frd` has the points of the table, so python-control evaluates model and data alike."""
+    table = lab.frequency_response.query("cart == 2")
+    measured = lab.frd["x2"]
+    assert isinstance(measured, control.FrequencyResponseData)
+    assert_array_equal(measured.omega, table["omega"])
+    assert_allclose(measured.magnitude, table["magnitude"], rtol=1e-12)  # rounding alone
+    model = lab.transfer_functions["x2"](1j * measured.omega)
+    assert np.median(np.abs(measured.complex / model - 1)) < 0.01  # a count in a hundred
+
+
+def test_margins_have_python_controls_names_and_order(lab):
+    """`gm, pm, sm, wpc, wgc, wms` are the margins of the design."""
+    gm, pm, sm, wpc, wgc, _ = lab.stability_margins()
+    margins = lab.design.margins
+    assert_allclose([gm, pm, sm], [margins.gain, margins.phase_deg, margins.modulus], rtol=1e-9)
+    assert_allclose([wpc, wgc], [margins.omega_gain, margins.omega_phase], rtol=1e-9)
 
 
 def test_an_analysis_shows_its_summary_and_its_table(lab):

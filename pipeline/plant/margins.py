@@ -43,6 +43,18 @@ class Margins:
     omega_gain: float | None = written("frequency to which `gain` refers, rad/s")
     omega_phase: float | None = written("frequency to which `phase_deg` refers, rad/s")
 
+    @classmethod
+    def of(cls, gm: float, pm: float, sm: float, wpc: float, wgc: float, _wms: float) -> "Margins":
+        """Return what `stability_margins` returned, by the keys of `results.json`."""
+        gain, phase = np.isfinite(gm), np.isfinite(pm)
+        return cls(
+            gain=gm if gain else None,
+            phase_deg=pm if phase else None,
+            modulus=sm,
+            omega_gain=wpc if gain else None,
+            omega_phase=wgc if phase else None,
+        )
+
 
 def closed_loop(
     chain: Chain, controller: StateFeedback, *, sample_time: float
@@ -73,17 +85,25 @@ def closed_loop(
 
 def stability_margins(
     chain: Chain, controller: StateFeedback, *, sample_time: float
-) -> Margins | None:
-    """Return the margins of the loop cut at the motor, or None if it is unstable.
+) -> tuple[float, float, float, float, float, float]:
+    """Return gm, pm, sm, wpc, wgc, wms of the loop cut at the motor.
+
+    They mean the same as those of `control.stability_margins`: gain margin (a factor), phase margin
+    in degrees, least distance of the Nyquist curve from -1, and the frequencies in rad/s at which
+    the phase is -180°, the gain is 1, and the curve is nearest to -1. A margin without a limit is
+    infinite, and its frequency is NaN. Unlike there, a limit at frequency 0 counts: beyond it, the
+    loop drifts away.
 
     Raises
     ------
-    DataError : a mode of the carts is undamped, for example because a fit held its damping at zero.
+    DataError : the loop is unstable; or a mode of the carts is undamped, for example because a fit
+        held its damping at zero.
     """
     A, B, C = broken_loop(chain, controller, sample_time=sample_time)
     opened, closed = np.linalg.eigvals(A), np.linalg.eigvals(A - np.outer(B, C))
     if np.abs(closed).max() >= 1:
-        return None
+        where = " on cartlab's bench, whose observer has no model," if not controller.model else ""
+        raise DataError(f"no margins: the loop{where} is unstable")
     if np.any((np.abs(np.abs(opened) - 1) < 1e-9) & (opened.imag != 0)):
         raise DataError("no margins: a mode of the carts has no damping")
     poles = np.append(opened, closed).astype(np.complex128)
@@ -101,14 +121,18 @@ def stability_margins(
     at_180, gain = at_180[real < 0], -1 / real[real < 0]
     at_one = _crossings(lambda omega: np.log(np.abs(response(omega))), omega)
     phase = np.degrees(np.angle(-response(at_one)))
-    gain_of, phase_of = np.argsort(np.abs(np.log(gain))), np.argsort(np.abs(phase))
-    return Margins(
-        gain=float(gain[gain_of[0]]) if gain.size else None,
-        phase_deg=float(phase[phase_of[0]]) if phase.size else None,
-        modulus=_least(lambda omega: np.abs(1 + response(omega)), np.append(omega, at_180)),
-        omega_gain=float(at_180[gain_of[0]]) if gain.size else None,
-        omega_phase=float(at_one[phase_of[0]]) if phase.size else None,
-    )
+    sm, wms = _least(lambda omega: np.abs(1 + response(omega)), np.append(omega, at_180))
+    gm, wpc = _nearest(gain, at_180, away=np.abs(np.log(gain)))
+    pm, wgc = _nearest(phase, at_one, away=np.abs(phase))
+    return gm, pm, sm, wpc, wgc, wms
+
+
+def _nearest(margins: Array, omega: Array, *, away: Array) -> tuple[float, float]:
+    """Return the margin with the least `away`, and its frequency; infinite and NaN without any."""
+    if not margins.size:
+        return np.inf, np.nan
+    i = int(away.argmin())
+    return float(margins[i]), float(omega[i])
 
 
 def _crossings(curve: Callable[[Array], Array], omega: Array) -> Array:
@@ -125,8 +149,8 @@ def _crossings(curve: Callable[[Array], Array], omega: Array) -> Array:
     return np.append(omega[sign == 0], np.array(found, dtype=np.float64))
 
 
-def _least(curve: Callable[[Array], Array], omega: Array) -> float:
-    """Return the least value of a curve, searched around the frequency where it is least."""
+def _least(curve: Callable[[Array], Array], omega: Array) -> tuple[float, float]:
+    """Return the least value of a curve and its frequency, searched around the least of `omega`."""
     from scipy.optimize import minimize_scalar
 
     omega = np.unique(omega)
@@ -134,7 +158,9 @@ def _least(curve: Callable[[Array], Array], omega: Array) -> float:
     i = int(values.argmin())
     bounds = omega[max(i - 1, 0)], omega[min(i + 1, omega.size - 1)]
     found = minimize_scalar(lambda w: curve(np.array([w]))[0], bounds=bounds, method="bounded")
-    return float(min(values[i], found.fun))
+    if found.fun < values[i]:
+        return float(found.fun), float(found.x)
+    return float(values[i]), float(omega[i])
 
 
 def _frequencies(z: ComplexArray, *, sample_time: float) -> Array:

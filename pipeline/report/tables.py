@@ -100,6 +100,7 @@ def record_frame(record: Record, *, analysis: Analysis) -> "pd.DataFrame":
 
     series, units = record_series(record), analysis.bench.units
     frame = pd.DataFrame(series).set_index("time")
+    frame.attrs["kind"] = record.kind
     frame.attrs["units"] = {
         name: {"time": "s", "u": units.input}.get(name, units.position) for name in series
     }

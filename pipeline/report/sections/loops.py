@@ -1,5 +1,7 @@
 """Sections on control: the designed feedback, and the comparison of model and measurement."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
@@ -60,24 +62,9 @@ def _weights(Q: Array) -> list[Block]:
 
 def _feedback_table(page: Page, design: FeedbackDesign) -> Table:
     """Return gains, prefilter, and the properties of the simulated step."""
-    position, drive = page.position, page.drive
-    rows = []
-    for i, value in enumerate(design.gains):
-        of, unit = ("velocity", f"{drive} s") if i % 2 else ("position", drive)
-        name = f"gain on the {of} of cart {i // 2 + 1}"
-        rows.append((name, significant(value), f"{unit}/{position}"))
-    if design.R is not None:
-        rows.append(("LQR weight of the input, R", significant(design.R), f"{position}/{drive}"))
-    rows += [
-        ("prefilter", significant(design.prefilter), f"{drive}/{position}"),
-        ("sample time T", significant(design.sample_time, digits=5), "s"),
-        ("delay of the effort", "1", "sample"),
-        ("overshoot", percent(design.overshoot_percent), ""),
-        ("settling time, 2 %", significant(design.settling_time, digits=3), "s"),
-        ("largest input", significant(design.peak_input, digits=3), drive),
-    ]
-    rows = [(what, value, unit_text(unit)) for what, value, unit in rows]
-    goal = f"{significant(design.reference)} {position}"
+    shown = replace(design, units=page.units).quantities()
+    rows = [(what, value, unit_text(unit)) for what, value, unit in shown]
+    goal = f"{significant(design.reference)} {page.position}"
     return page.table(_WORDS, "feedback_table", rows, "ldl", cart=design.cart, goal=goal)
 
 
