@@ -163,7 +163,7 @@ def test_a_wrong_name_is_answered_with_the_right_ones(lab, table):
 
 
 def test_the_measured_frequency_response_is_python_controls(lab):
-    """`lab.frd` has the points of the table, so python-control evaluates model and data alike."""
+    """`lab.frd` has the points of the table, as an object that python-control plots."""
     table = lab.frequency_response.query("cart == 2")
     measured = lab.frd["x2"]
     assert isinstance(measured, control.FrequencyResponseData)

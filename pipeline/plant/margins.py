@@ -88,11 +88,11 @@ def stability_margins(
 ) -> tuple[float, float, float, float, float, float]:
     """Return gm, pm, sm, wpc, wgc, wms of the loop cut at the motor.
 
-    They mean the same as those of `control.stability_margins`: gain margin (a factor), phase margin
-    in degrees, least distance of the Nyquist curve from -1, and the frequencies in rad/s at which
-    the phase is -180°, the gain is 1, and the curve is nearest to -1. A margin without a limit is
-    infinite, and its frequency is NaN. Unlike there, a limit at frequency 0 counts: beyond it, the
-    loop drifts away.
+    They mean the same as those of `control.stability_margins`. The margins are that of the gain (a
+    factor), that of the phase in degrees, and the least distance of the Nyquist curve from -1. At
+    the frequencies (rad/s) the phase is -180°, the gain is 1, and the curve is nearest to -1.
+    A margin without a limit is infinite, and its frequency is NaN. Unlike there, a limit at
+    frequency 0 counts: beyond it, the loop drifts away.
 
     Raises
     ------
