@@ -1165,6 +1165,18 @@ class Analysis:
         return StateSpaceMatrices(A=A, B=B, C=C, D=D)
 
     fit: ChainFit | None = written()
+
+    @computed()
+    def unexplained_share(self) -> float | None:
+        """The share of the fitted motion (rms) that neither the fitted carts nor noise explain."""
+        if self.fit is None or not self.fit.converged:
+            return None
+        shares = [self.unexplained[run] for run in self.fit.experiments if run in self.unexplained]
+        if shares:
+            return float(np.sqrt(max(np.mean(shares), 0.0)))
+        # A table of amplitude ratios has no recordings.
+        return self.fit.misfit if self.fit.method == "bode_fit" else None
+
     log_decrements: tuple[LogDecrement, ...] = written()
     step_gains: tuple[StepGain, ...] = written()
     frequency_responses: tuple[FrequencyResponse, ...] = written(key="frequency_response")

@@ -6,11 +6,14 @@ Each command imports its own heavy modules, so that `--help` answers at once.
 """
 
 import errno
+import re
+import shutil
 import signal
 import sys
+import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
@@ -60,6 +63,8 @@ app = typer.Typer(
 )
 
 FIRST_WORD, _LAST_PAUSE = 2.0, 60.0  # s between messages: the first pause, and the longest
+PIPE_WIDTH = 80  # characters in a line that is not for a terminal
+_SENTENCE = re.compile(r".+?[.?!](?= [A-Z]|$)")
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A submission folder.")]
 Preset = Annotated[str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")]
@@ -124,6 +129,71 @@ def _misuse(error: TyperException) -> str:
 def _fail(message: str) -> None:
     say(f"cartlab: {message}")
     sys.exit(2)
+
+
+def say_briefly(text: str, *, most: int, more: str) -> None:
+    """Print a long message in at most `most` lines of the terminal's width; see `brief_lines`."""
+    width = (
+        shutil.get_terminal_size((PIPE_WIDTH, 24)).columns if sys.stderr.isatty() else PIPE_WIDTH
+    )
+    for line in brief_lines(text, width=width, most=most, more=more):
+        say(line)
+
+
+def brief_lines(text: str, *, width: int, most: int, more: str) -> list[str]:
+    """Return paragraphs and list items as at most `most` lines of `width` characters.
+
+    If they are too long, each is cut to its first sentence, then items to two lines, then to one.
+    At last, items of the longest list are left out, but neither its first nor its last.
+
+    Parameters
+    ----------
+    text : one paragraph or one item ("- …") a line.
+    more : where the rest is, such as "the page".
+    """
+    paragraphs = text.splitlines()
+    for cut in (None, 0, 2, 1):
+        if cut == 0:
+            paragraphs = [_first_sentence(one) for one in paragraphs]
+        lines = [_wrapped(one, width=width, most=cut or most) for one in paragraphs]
+        if sum(map(len, lines)) <= most:
+            return [line for one in lines for line in one]
+    lists = _lists(paragraphs)
+    left_out = 0
+    while sum(map(len, lines)) + 1 > most and (longest := max(lists, key=len, default=[])):
+        lines[longest.pop(-2 if len(longest) > 2 else -1)] = []
+        left_out += 1
+    return [*(line for one in lines for line in one), f"- {left_out} more: see {more}"]
+
+
+def _first_sentence(paragraph: str) -> str:
+    found = _SENTENCE.match(paragraph)
+    return found[0] if found else paragraph
+
+
+def _wrapped(paragraph: str, *, width: int, most: int) -> list[str]:
+    """Return a paragraph in at most `most` lines, without breaking names and paths."""
+    item = paragraph.startswith("- ")
+    return textwrap.wrap(
+        paragraph,
+        width,
+        subsequent_indent="  " if item else "",
+        break_long_words=False,
+        break_on_hyphens=False,
+        max_lines=most if item else None,
+        placeholder=" …",
+    )
+
+
+def _lists(paragraphs: Sequence[str]) -> list[list[int]]:
+    """Return the places of the items of each list."""
+    lists: list[list[int]] = [[]]
+    for i, one in enumerate(paragraphs):
+        if one.startswith("- "):
+            lists[-1].append(i)
+        elif lists[-1]:
+            lists.append([])
+    return lists
 
 
 def say(text: str) -> None:

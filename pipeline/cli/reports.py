@@ -22,6 +22,7 @@ from pipeline.cli.common import (
     app,
     progress_line,
     say,
+    say_briefly,
 )
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.second_process import SecondProcess
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
     from pipeline.results import Analysis
     from pipeline.simulated.bench import SimulatedBench
     from pipeline.submission import Submission
+
+
+_MOST_LINES = 17  # of the summary of a report; the lines on files and status come after it
 
 
 @app.command()
@@ -199,8 +203,9 @@ def run_report(
             )
         if out.resolve() == own.resolve():
             write_findings(analysis, out, changes=changes, made_of=made_of)
-    for line in (draft.summary, *_unreadable(analysis), *draft.remarks):
-        say(line)
+    page = out / "report.html"
+    told = [draft.summary, *_unreadable(analysis), *draft.remarks]
+    say_briefly("\n".join(told), most=_MOST_LINES, more=str(page))
     say(_wrote(out, "report", pdf=files.pdf))
     if files.plots:
         say(f"wrote {out / 'compare.html'}")

@@ -125,7 +125,7 @@ def clock_notes(
         even = "" if clock.pieces == 1 else f", in {clock.pieces} pieces"
         said = (
             f"time stamps rounded to {clock.rounding:g} s were replaced by even ones: "
-            f"one sample every {1e3 * (clock.period or interval):.6g} ms{even}"
+            f"one sample every {1e3 * (clock.period or interval):.4g} ms{even}"
         )
         notes.append(Note(said, "rounded", about=column.name))
     notes += [

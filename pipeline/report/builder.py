@@ -56,6 +56,8 @@ class PageBuilder:
         rows: Iterable[Sequence[Cell | str | Spans]],
         align: str,
         /,
+        *,
+        is_numbered: bool = True,
         **values: object,
     ) -> Table:
         """Return a table with the next number; see `make_table`.
@@ -64,10 +66,14 @@ class PageBuilder:
         ----------
         words : the texts of the page.
         key : key of the caption; the headings have the key `{key}_head`.
+        is_numbered : false for a table without a number and a visible caption.
         values : values that are inserted into the caption and the headings.
         """
         head = [rich(text) for text in words.cells(f"{key}_head", **values)]
-        return self.headed_table(words.text(key, **values), head[: len(align)], rows, align)
+        caption, head = words.text(key, **values), head[: len(align)]
+        if not is_numbered:
+            return make_table(0, caption, head, rows, align)
+        return self.headed_table(caption, head, rows, align)
 
     def headed_table(
         self,

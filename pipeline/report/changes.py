@@ -219,7 +219,7 @@ def _number_row(change: Change) -> list[Cell]:
     return [
         cell(name_span(change.name) if is_estimate else rich(clean(change.name))),
         cell(change.what, "quiet"),
-        cell(unit_text(clean(known.unit if known else "")) or "1"),
+        cell(unit_text(clean(known.unit if known else ""))),
         *(cell(with_error(n.value, n.std) if n else NOTHING) for n in drafts),
         # A change of less than one standard error is shown in a quiet colour.
         cell(_moved(change), "quiet" if sigmas is not None and abs(sigmas) < 1.0 else ""),

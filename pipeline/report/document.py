@@ -103,7 +103,6 @@ class Table:
     ----------
     align : one letter for each column: l, c, r or d (on the decimal mark).
     finder : whether readers of the page can search and sort the table.
-    small : whether the table is in small print, for reference.
     """
 
     number: int
@@ -112,20 +111,16 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     align: str
     finder: bool = False
-    small: bool = False
     kind: str = field(default="table", init=False)
 
     @cached_property
     def is_wide(self) -> bool:
-        """Whether a phone has too little room for the columns, so that it shows rows as lines.
-
-        Small print breaks anywhere, so it always fits.
-        """
+        """Whether a phone has too little room for the columns, so that it shows rows as lines."""
         widths = [max(map(len, plain(one.text).split()), default=0) for one in self.head]
         for row in self.rows:
             lengths = (len(plain(one.text)) for one in row)
             widths = [max(pair) for pair in zip(widths, lengths, strict=True)]
-        return not self.small and sum(widths) + 2 * (len(widths) - 1) > _PHONE
+        return sum(widths) + 2 * (len(widths) - 1) > _PHONE
 
 
 @dataclass(frozen=True)
@@ -169,13 +164,20 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
-    """A board of the most important facts."""
+    """A board of the most important facts.
+
+    Attributes
+    ----------
+    across : tiles in one row; by default, as many as make the rows equally long.
+    """
 
     tiles: tuple[Tile, ...]
-    across: int = field(init=False)
+    across: int = 0
     kind: str = field(default="tiles", init=False)
 
     def __post_init__(self) -> None:
+        if self.across:
+            return
         most = _WIDE_TILES if self.longest > _LONG else _MOST_TILES
         rows = -(-len(self.tiles) // most)
         # Make the rows equally long.
@@ -189,10 +191,16 @@ class Tiles:
 
 @dataclass(frozen=True)
 class Details:
-    """Blocks that a page hides until a reader opens them; in print they are always shown."""
+    """Blocks that a page hides until a reader opens them.
+
+    Attributes
+    ----------
+    in_print : what the PDF shows instead; by default, the blocks themselves.
+    """
 
     title: Spans
     blocks: tuple["Block", ...]
+    in_print: tuple["Block", ...] | None = None
     kind: str = field(default="details", init=False)
 
 
@@ -228,11 +236,13 @@ class Section:
     Attributes
     ----------
     id : the section's anchor on the page.
+    in_print : whether the PDF has the section.
     """
 
     id: str
     title: str
     blocks: tuple[Block, ...]
+    in_print: bool = True
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,6 @@ from pipeline.report.gap_verdict import (
     verdict_title,
     whole_model,
 )
-from pipeline.report.sections.housekeeping import provenance_blocks
 from pipeline.report.sections.parameters import chain_table
 from pipeline.results import Analysis, Intervention
 from pipeline.words.numbers import count, listing, percent, unit_text, with_error
@@ -113,8 +112,8 @@ def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = sil
         ("apart", "How to decide between the explanations", lambda page: _apart(page, gap)),
         ("model", capital(whole_model(gap)), lambda page: _model(page, gap)),
         ("method", "How this was found", lambda page: _method(gap)),
-        ("warnings", "Warnings", lambda page: remarks(analysis.warnings)),
-        ("provenance", "Provenance", lambda page: provenance_blocks(page, made)),
+        ("warnings", "Remarks", lambda page: remarks(analysis.warnings)),
+        ("provenance", "Provenance", lambda _: [paragraph(made)]),
     ]
     return page.document(
         page.sections(parts, doing="gap report", progress=progress),

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING
 from pipeline import __version__
 from pipeline.report.builder import Page, Part, remarks
 from pipeline.report.changes import DraftChanges, change_blocks, changes_line
-from pipeline.report.document import Block, Document, Heading, Paragraph, paragraph
+from pipeline.report.document import (
+    Block,
+    Code,
+    Details,
+    Document,
+    Heading,
+    Paragraph,
+    Section,
+    Table,
+    paragraph,
+)
 from pipeline.report.equations.model import (
     equations_of_motion,
     numeric_state_space,
@@ -21,7 +31,6 @@ from pipeline.report.pdf import missing_characters
 from pipeline.report.sections.housekeeping import (
     assumption_blocks,
     check_blocks,
-    provenance_blocks,
     skipped_blocks,
 )
 from pipeline.report.sections.loops import feedback_blocks, hardware_blocks
@@ -36,14 +45,13 @@ from pipeline.report.sections.parameters import chain_table, parameter_blocks
 from pipeline.report.sections.questions import (
     Asked,
     ask,
-    open_line,
     open_questions,
     placed,
     split_notes,
 )
 from pipeline.report.sections.summary import summary, terminal_summary
 from pipeline.results import Analysis
-from pipeline.words.numbers import count
+from pipeline.words.numbers import count, listing
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
 from pipeline.words.text import spans, with_symbols
@@ -81,9 +89,14 @@ def build_document(
     notes = "" if answer else analysis.discussion or ""
     written, rest = split_notes(discussion_blocks(notes), asked)
     answers = {one.id: (answer(one),) for one in asked} if answer else written
-    made = _WORDS.text("made", version=__version__)
+    unanswered = [question for question in asked if question.id not in answers]
+    made = _WORDS.text("made" if answer else "made_of", version=__version__)
     parts: Sequence[Part] = (
-        ("summary", "Summary", lambda page: [*summary(page), *gap_short(page)]),
+        (
+            "summary",
+            "Summary",
+            lambda page: [*summary(page, open_questions=unanswered), *gap_short(page)],
+        ),
         ("changes", "Since the earlier draft", lambda page: change_blocks(page, changes)),
         *(worked or (("model", "The model", _model),)),
         ("parameters", "Initial and final estimates", parameter_blocks),
@@ -105,15 +118,36 @@ def build_document(
             "Discussion",
             lambda page: [*open_questions(asked, answers, by_model=answer is not None), *rest],
         ),
-        ("warnings", "Warnings", lambda page: remarks(analysis.warnings)),
+        ("warnings", "Remarks", lambda page: remarks(analysis.warnings)),
         ("skipped", "What was skipped", skipped_blocks),
-        ("provenance", "Provenance", lambda page: provenance_blocks(page, made)),
+        ("provenance", "Provenance", lambda _: [paragraph(made)]),
     )
     sections = page.sections(parts, doing="report", progress=progress)
     return page.document(
-        placed(sections, asked, answers),
+        map(_shorter_in_print, placed(sections, asked, answers)),
         about=f"Identification and control of {count(analysis.bench.n, 'cart')}",
     )
+
+
+def _shorter_in_print(section: Section) -> Section:
+    """Return a section whose long tables only the page has, with the changes of a draft."""
+    if section.id == "changes":
+        return replace(section, in_print=False)
+    if section.id in ("steady-state", "feedback"):
+        return replace(section, blocks=tuple(map(_on_the_page, section.blocks)))
+    return section
+
+
+def _on_the_page(block: Block) -> Block:
+    """Return a folded table or a program so that the PDF only says where it is."""
+    if isinstance(block, Details):
+        tables = [str(one.number) for one in block.blocks if isinstance(one, Table)]
+        said = paragraph(_WORDS.text("dwells_on_the_page", tables=listing(tables)))
+        return replace(block, in_print=(said,))
+    if isinstance(block, Code):
+        said = paragraph(_WORDS.text("code_on_the_page"))
+        return Details(_WORDS.spans("code"), (block,), in_print=(said,))
+    return block
 
 
 # ----------------------------------------------------------------------- model
@@ -178,7 +212,6 @@ def make_draft(
     """Return the report of an analysis."""
     lines = (
         changes and with_symbols(changes_line(changes)),
-        open_line(analysis),
         *(f"notes.md: {line}" for line in formula_problems(analysis.discussion or "")),
     )
     return Draft(

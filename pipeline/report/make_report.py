@@ -46,7 +46,7 @@ class Draft:
     ----------
     files : contents of the pages and figures.
     summary : what was found, for a terminal.
-    remarks : lines on the changes, the open questions, and formulas that are not typeset.
+    remarks : lines on the changes, and on formulas that are not typeset.
     """
 
     files: Made

@@ -1,6 +1,7 @@
 """Render a document as PDF with typst; all content goes in as JSON, so no text is markup."""
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ _SHOWN_IN_WARNING = 20
 
 def render_pdf(document: Document) -> bytes:
     """Return the PDF (archival A-2a, accessible UA-1), which uses only the fonts of cartlab."""
+    document = replace(document, sections=tuple(s for s in document.sections if s.in_print))
     text = json.dumps(_printable(as_json(document)), ensure_ascii=False, allow_nan=False)
     figures = {f"{one.number}.svg": _printable(one.svg).encode() for one in document.pictures()}
     parts: Any = {

@@ -7,8 +7,9 @@ from collections.abc import Iterable, Sequence
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _SUBSCRIPT = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _PLAIN_RANGE = (1e-3, 1e5)  # numbers of this size are written without a power of ten
-_MOST_DIGITS = 8
-_FINEST = 1e-8  # a smaller relative error belongs to exact data and does not limit the digits
+_MOST_DIGITS = 5
+_FINEST = 1e-8  # a smaller relative error belongs to exact data and is not told
+SMALL_ERROR = 1e-4  # a smaller relative error is only told to be so: no calibration is that good
 NOTHING = "–"
 _TIMES = " × 10"
 _WHOLE = re.compile(r"[^\w]*\d+(?=\D|$)")
@@ -17,7 +18,7 @@ _HYPHEN = re.compile(r"(?<![\w.)\]])-(?=\d)")
 # A space next to ± or ×, before % or °, or between a number and its unit.
 _JOINT = re.compile(
     r"(?<=[\d⁰¹²³⁴-⁹)]) (?=[±×%°σ]|(?:(?:[kmµ]?(?:Hz|V|A|N|g|m|s)|cm|rad|dB|min|h|counts?)\b))"
-    r"|(?<=[±×]) (?=[\d(])"
+    r"|(?<=[±×<]) (?=[\d(<])"
 )
 _SIGNED_ZERO = re.compile(r"[+−]0\.0 %")
 
@@ -45,12 +46,14 @@ def with_errors(column: Sequence[tuple[float, float | None]]) -> list[str]:
 def with_error(value: float, std: float | None, *, digits: int = 2, power: bool = False) -> str:
     """Return "value ± std", rounded to `digits` digits of the standard error.
 
-    A power of ten is used if the number is very large or very small, or if `power` is true.
+    An error below 0.01 % of the value is written "± < 0.01 %". A power of ten is used if the number
+    is very large or very small, or if `power` is true.
     """
     if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
         return significant(value, power=power)
-    if std < _FINEST * abs(value):
-        return significant(value, digits=_MOST_DIGITS, power=power)
+    if std < SMALL_ERROR * abs(value):
+        text = significant(value, digits=_MOST_DIGITS, power=power)
+        return text if std < _FINEST * abs(value) else f"{text} ± {share(std / abs(value))}"
     size = _exponent(max(abs(value), std), digits=2)
     if _is_plain(size) and not power:
         decimals = digits - 1 - _exponent(std, digits=digits)
@@ -59,6 +62,13 @@ def with_error(value: float, std: float | None, *, digits: int = 2, power: bool 
     decimals = digits - 1 - _exponent(std / scale, digits=digits)
     inside = f"{_fixed(value / scale, decimals)} ± {_fixed(std / scale, decimals)}"
     return f"({inside}){_TIMES}{_superscript(size)}"
+
+
+def share(ratio: float) -> str:
+    """Return a share as a percentage with at most two digits; a very small one as "< 0.01 %"."""
+    if ratio < SMALL_ERROR:
+        return "< 0.01 %"
+    return f"{significant(100 * ratio, digits=2 if ratio >= 0.001 else 1)} %"
 
 
 def complex_text(value: complex, *, digits: int) -> str:

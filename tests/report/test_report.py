@@ -17,6 +17,7 @@ import pytest
 from pipeline.identify.recording_checks import check_files, check_left_out
 from pipeline.plant.chain import Chain
 from pipeline.report.builder import Page as Shown  # what sections are made of
+from pipeline.report.changes import DraftChanges
 from pipeline.report.document import (
     Document,
     Paragraph,
@@ -30,8 +31,8 @@ from pipeline.report.html import render_blocks, render_html
 from pipeline.report.lab_report import build_document, make_draft
 from pipeline.report.make_report import Files, write_draft
 from pipeline.report.pdf import missing_characters, render_pdf
-from pipeline.report.sections.housekeeping import file_table, provenance_blocks
 from pipeline.report.sections.measurements import decay_blocks
+from pipeline.report.sections.questions import unanswered
 from pipeline.report.sections.summary import summary, terminal_summary
 from pipeline.results import Analysis, Check, Estimate, Finding, ParameterRow, Skipped, Stage
 from pipeline.setup import Setup, Units
@@ -113,30 +114,16 @@ def test_figures_are_in_the_same_sections_in_print(folders):
     assert len([place for place in places if place.startswith("Figure")]) > 8
 
 
-def test_no_printed_page_has_a_single_row_of_files(folders):
-    """A long list of files is split so that no page ends with a single row."""
-    # one file more than fits on a page
-    files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(97)}
-    analysis = replace(make_analysis(1), files=files)
-    table = file_table(Shown(analysis))
-    document = Document("A", "", (), (Section("p", "Provenance", (table,)),), "")
-
-    pages = pypdf.PdfReader(io.BytesIO(render_pdf(document))).pages
-
-    rows = [len(re.findall(r"run-\d{3}", page.extract_text())) for page in pages]
-    assert sum(rows) == 97
-    assert min(rows) > 20
-
-
-@pytest.mark.parametrize(("number", "tall", "pages"), [(6, 1.02, 4), (7, 0.66, 3), (2, 0.66, 1)])
-def test_figures_in_a_row_fill_pages(number, tall, pages):
-    """Figures are drawn slightly smaller if one more figure then fits on a page."""
-    svg = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 {100 * tall}"/>'
+def test_figures_that_follow_each_other_are_printed_in_pairs():
+    """Two figures in a row of the same section share a line, so that six fit on a page."""
+    svg = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 66"/>'
     row = tuple(
         Picture(number=n, name=f"p{n}", caption=spans("Two words"), alt="nothing", draw=lambda: svg)
-        for n in range(number)
+        for n in range(6)
     )
-    assert len(printed(Section("f", "Figures", row))) == pages
+    apart = tuple(part for one in row for part in (one, Paragraph(spans("A line."))))
+    pages = [len(printed(Section("f", "Figures", blocks))) for blocks in (row, apart)]
+    assert pages[0] == 1 < pages[1]
 
 
 def printed(*sections: Section) -> list[str]:
@@ -145,7 +132,7 @@ def printed(*sections: Section) -> list[str]:
     return [page.extract_text() for page in pypdf.PdfReader(io.BytesIO(render_pdf(document))).pages]
 
 
-@pytest.mark.parametrize("rows", [12, 20, 30])
+@pytest.mark.parametrize("rows", [18, 30, 40])
 def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
     """A table longer than a page breaks, and its heading stays with its first rows."""
     body = tuple((cell(f"row-{i:02d}"), cell("Dry friction holds it. " * 24)) for i in range(rows))
@@ -159,17 +146,19 @@ def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
     assert len(re.findall(r"row-\d\d", first + "".join(others))) == rows
 
 
-def test_the_list_of_files_is_never_alone_on_a_page():
-    """The list of files is never on a page without its heading and sentence."""
-    files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(40)}
-    shown = Shown(replace(make_analysis(1), files=files))
-    blocks = tuple(provenance_blocks(shown, "Made by the program."))
-    line = Paragraph(spans("A line."))
-
-    pages = printed(*(Section(f"s{n}", "Provenance", (*[line] * n, *blocks)) for n in range(20)))
-
-    for page in pages:
-        assert page.count("Made by") == page.count("run-000")
+def test_print_is_shorter_than_the_page(folders):
+    """The page has every check, dwell and change of a draft; the PDF has a line a kind of check."""
+    analysis = make_analysis(3)
+    html = (folders[3] / "report.html").read_text(encoding="utf-8")
+    pdf = printed_text(folders[3])
+    for check in analysis.checks:
+        assert f"<code>{check.id}</code>" in html
+        assert check.kind in pdf
+        assert (check.id in pdf) == (check.outcome == "fail" or check.id == check.kind)
+    assert not any(sha in text for sha in analysis.files.values() for text in (html, pdf))
+    document = build_document(analysis, changes=DraftChanges(numbers=(), failed={}))
+    assert "changes" in sections(document)
+    assert sections(document)["changes"].title not in "".join(printed(*document.sections))
 
 
 @pytest.mark.parametrize(
@@ -476,8 +465,10 @@ def test_the_summary_reports_a_poor_result():
     hardware = tuple(replace(check, nrmse=0.4) for check in analysis.hardware)
     fit = replace(analysis.fit, chi_square_per_dof=9.0)
     text = terminal_summary(replace(analysis, fit=fit, rows=rows, hardware=hardware))
-    assert "±" in terminal_summary(analysis)  # requires a fit whose error is only noise
-    assert "±" not in text
+    poor = replace(analysis, fit=fit)
+    # An error is shown only if the fit's residual is only noise.
+    boards = [[plain(tile.note) for tile in tiles(summary(Shown(a)))] for a in (analysis, poor)]
+    assert [any("±" in note for note in board) for board in boards] == [True, False]
     (unsettled,) = {point.experiment for point in analysis.sine_points if not point.settled}
     for said in ("K_1 (+23.4 %)", unsettled, *(check.id for check in analysis.failed_checks)):
         assert said in text
@@ -545,11 +536,16 @@ def test_the_summary_of_a_good_result_is_short():
     points = tuple(replace(point, settled=True) for point in analysis.sine_points)
     good = replace(analysis, rows=rows, checks=checks, sine_points=points, skipped=(), warnings=())
     assert good.feedback is not None
+    asked = unanswered(good)
+    assert asked
+    unread = terminal_summary(good)
+    answered = "".join(f"## {question.id}\n\nFriction.\n\n" for question in asked)
+    good = replace(good, discussion=answered)
     missed = replace(good.feedback, reachable=False, message="settling in 1 ms cannot be met")
     worse = (good, replace(good, warnings=("odd",)), replace(good, feedback=missed))
     texts = [terminal_summary(one) for one in worse]
     assert len(texts[0].splitlines()) == min(len(text.splitlines()) for text in texts)
-    assert ["Nothing stands" in text for text in texts] == [True, False, False]
+    assert ["Nothing to fix" in text for text in (unread, *texts)] == [False, True, True, False]
 
 
 def test_damping_at_one_amplitude_is_not_drawn():

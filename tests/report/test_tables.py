@@ -33,8 +33,8 @@ def test_a_wrong_reported_number_gets_a_hint():
     (hint,) = more - set(terminal_summary(page(estimates).analysis).splitlines())
     assert "ω_n" in hint
     assert "K" not in hint
-    found = rows([reported_table(shown)])
-    assert (found["K"][1], found["K"][-1]) == (mine["K"], "")
+    found = rows([reported_table(shown, beside=1)])
+    assert (found["K"][4], found["K"][-1]) == (mine["K"], "")
     assert found["ω_n"][-2] == "−84.1 %"
     assert "Hz" in found["ω_n"][-1]
 
@@ -44,8 +44,10 @@ def test_a_number_is_not_compared_with_an_assumed_value():
     row = make_analysis(1).rows[0]
     assert row.initial
     assumed = replace(row, initial=replace(row.initial, source="assumed"))
-    table = reported_table(page([assumed], {"initial": {row.name: Decimal("99999")}}))
-    assert [plain(cell.text) for cell in table.rows[0]][-2:] == ["–", ""]
+    shown = page([assumed], {"initial": {row.name: Decimal("99999")}})
+    table = reported_table(shown, beside=1)
+    assert plain(table.rows[0][4].text) == "–"
+    assert plain(table.rows[0][-1].text) == ""
 
 
 def test_a_number_without_an_estimate_has_a_dash():
@@ -55,10 +57,10 @@ def test_a_number_without_an_estimate_has_a_dash():
     """
     row = make_analysis(1).rows[0]
     mine = {row.name: Decimal("3.0")}
-    table = reported_table(page([replace(row, final=None)], {"final": mine}))
-    assert [plain(cell.text) for cell in table.rows[0]][3:] == ["–", row.unit, "–", ""]
+    table = reported_table(page([replace(row, final=None)], {"final": mine}), beside=1)
+    assert [plain(cell.text) for cell in table.rows[0]][5:] == ["3.0", "–", "–", ""]
     mass = replace(row, name="mass", unit="V s^2/cm")
-    table = reported_table(page([mass], {"final": {"mass": Decimal("99999")}}))
+    table = reported_table(page([mass], {"final": {"mass": Decimal("99999")}}), beside=1)
     assert table.rows[0][-2].tone == "bad"
     assert plain(table.rows[0][-1].text) == ""
 

@@ -1,12 +1,20 @@
-"""Sections on checks, warnings, skipped stages, and the origin of the numbers."""
+"""Sections on checks, assumptions and skipped stages."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from pipeline.report.builder import Page
-from pipeline.report.document import Block, Details, Table, Tone, bullet_list, cell, paragraph
+from pipeline.report.document import (
+    Block,
+    Details,
+    Table,
+    Tone,
+    bullet_list,
+    cell,
+    make_table,
+    paragraph,
+)
 from pipeline.results import Assumption, Check
-from pipeline.words.numbers import count, listing
+from pipeline.words.numbers import count, join_names, listing
 from pipeline.words.phrases import phrases
 from pipeline.words.text import Span, clean, rich, spans
 
@@ -19,7 +27,7 @@ OUTCOMES: dict[str, tuple[str, Tone]] = {  # in the order of the table
 
 
 def check_blocks(page: Page) -> list[Block]:
-    """Return the checks; those that did not fail are folded."""
+    """Return the checks; those that did not fail are folded, and one line a kind in print."""
     failed = page.analysis.failed_checks
     others = [check for check in page.analysis.checks if check not in failed]
     passed = sum(check.outcome == "pass" for check in others)
@@ -30,11 +38,34 @@ def check_blocks(page: Page) -> list[Block]:
         title = f"{count(passed, 'check')} passed"
         if unchecked := len(others) - passed:
             title += f", {unchecked} could not be done"
-        blocks.append(Details(spans(title), (_check_table(page, others, "other_checks_table"),)))
+        folded = _check_table(page, others, "other_checks_table", is_numbered=False)
+        blocks.append(Details(spans(title), (folded,), in_print=(_kind_table(others),)))
     return blocks
 
 
-def _check_table(page: Page, checks: Sequence[Check], key: str) -> Table:
+def _kind_table(checks: Sequence[Check]) -> Table:
+    """Return each kind of check: its question, and how many passed or could not be done."""
+    kinds: dict[str, list[Check]] = {}
+    for check in checks:
+        kinds.setdefault(check.kind, []).append(check)
+    rows = []
+    for kind, found in kinds.items():
+        passed = sum(check.outcome == "pass" for check in found)
+        outcomes = [f"{passed} passed"] if passed else []
+        outcomes += [f"{len(found) - passed} not done"] if passed < len(found) else []
+        rows.append(
+            [
+                cell(", ".join(outcomes), "good" if passed else "quiet"),
+                cell(Span(clean(kind), "code")),
+                cell(_WORDS.spans(f"kind_{kind}")),
+            ]
+        )
+    return make_table(0, "", _WORDS.cells("kind_table_head"), rows, "lll")
+
+
+def _check_table(
+    page: Page, checks: Sequence[Check], key: str, *, is_numbered: bool = True
+) -> Table:
     order = list(OUTCOMES)
     rows = [
         [
@@ -44,14 +75,32 @@ def _check_table(page: Page, checks: Sequence[Check], key: str) -> Table:
         ]
         for check in sorted(checks, key=lambda check: order.index(check.outcome))
     ]
-    return page.table(_WORDS, key, rows, "lll")
+    return page.table(_WORDS, key, rows, "lll", is_numbered=is_numbered)
 
 
 def assumption_blocks(page: Page) -> list[Block]:
-    """Return the assumptions of the analysis, their sources, and whether the data support them."""
+    """Return the assumptions of the analysis, their sources, and whether the data support them.
+
+    Those that the data support are folded, and one line in print.
+    """
     assumptions = page.analysis.assumptions
-    if not assumptions:
-        return []
+    supported = [one for one in assumptions if one.support == "supported"]
+    others = [one for one in assumptions if one.support != "supported"]
+    blocks: list[Block] = []
+    if others:
+        blocks.append(_assumption_table(page, others))
+    if supported:
+        named = dict.fromkeys(f"{one.key} {one.about}".strip() for one in supported)
+        title = _WORDS.spans("supported", n=count(len(supported), "assumption"))
+        folded = _assumption_table(page, supported, is_numbered=False)
+        in_print = (paragraph(title, ": ", clean(join_names(list(named), most=12)), "."),)
+        blocks.append(Details(title, (folded,), in_print=in_print))
+    return blocks
+
+
+def _assumption_table(
+    page: Page, assumptions: Sequence[Assumption], *, is_numbered: bool = True
+) -> Table:
     tones: dict[str, Tone] = {"supported": "good", "contradicted": "bad", "open": "quiet"}
     rows = [
         [
@@ -64,7 +113,7 @@ def assumption_blocks(page: Page) -> list[Block]:
         ]
         for one in assumptions
     ]
-    return [page.table(_WORDS, "assumption_table", rows, "llllll")]
+    return page.table(_WORDS, "assumption_table", rows, "llllll", is_numbered=is_numbered)
 
 
 def taken_text(one: Assumption) -> str:
@@ -87,25 +136,3 @@ def skipped_blocks(page: Page) -> list[Block]:
         for skip in page.analysis.skipped
     ]
     return [bullet_list(items)] if items else []
-
-
-def provenance_blocks(page: Page, made: str) -> list[Block]:
-    """Return the versions with which the report was made, and the SHA-256 of its files, folded.
-
-    Parameters
-    ----------
-    made : a sentence that states the versions.
-    """
-    blocks: list[Block] = [paragraph(made)]
-    if files := page.analysis.files:
-        blocks.append(Details(spans(count(len(files), "data file")), (file_table(page),)))
-    return blocks
-
-
-def file_table(page: Page) -> Table:
-    """Return the data files with their SHA-256."""
-    rows = [
-        [cell(Span(clean(text), "code")) for text in entry]
-        for entry in sorted(page.analysis.files.items())
-    ]
-    return replace(page.table(_WORDS, "file_table", rows, "ll"), small=True)

@@ -8,7 +8,7 @@ from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.report.builder import Page
 from pipeline.report.document import Block, Cell, Heading, Table, bullet_list, cell, paragraph
-from pipeline.results import Analysis, Estimate, ParameterRow
+from pipeline.results import EXPLAINED, Analysis, Estimate, ParameterRow
 from pipeline.words.numbers import (
     NOTHING,
     listing,
@@ -29,13 +29,18 @@ def parameter_blocks(page: Page) -> list[Block]:
     rows, reported = page.analysis.rows, page.analysis.reported
     if not rows:
         return []
-    blocks: list[Block] = [paragraph(_origins(page.analysis)), parameter_table(page)]
+    table = parameter_table(page)
+    blocks: list[Block] = [paragraph(_origins(page.analysis)), table]
+    blocks += _fit_quality(page.analysis)
     if remarks := _parameter_notes(rows):
         blocks.append(bullet_list(remarks))
     if staged := _staged_differences(page.analysis):
         blocks.append(staged)
     if any(reported.values()):
-        blocks += [Heading(spans(_WORDS.text("reported"))), reported_table(page)]
+        blocks += [
+            Heading(spans(_WORDS.text("reported"))),
+            reported_table(page, beside=table.number),
+        ]
     return blocks
 
 
@@ -60,6 +65,20 @@ def _origins(analysis: Analysis) -> Spans:
             else "",
         ).strip()
     )
+
+
+def _fit_quality(analysis: Analysis) -> list[Block]:
+    """Return how well the fit explains the data."""
+    fit = analysis.fit
+    if fit is None or not fit.converged:
+        return []
+    said = _WORDS.text(
+        "fit_quality",
+        chi_square=significant(fit.chi_square_per_dof, digits=3),
+        points=fit.n_points,
+        limit=f"{EXPLAINED:g}",
+    )
+    return [paragraph(said)]
 
 
 def parameter_table(page: Page) -> Table:
@@ -113,7 +132,7 @@ def source_text(estimate: Estimate | None, *, steps: Collection[str]) -> str:
 
 
 def _unit(row: ParameterRow) -> str:
-    return unit_text(clean(row.unit)) or "1"
+    return unit_text(clean(row.unit))
 
 
 def _of_column(row: ParameterRow, column: str) -> str:
@@ -134,39 +153,51 @@ def _verdict(consistent: bool | None) -> Cell:
     return cell("agree", "good") if consistent else cell("differ", "bad")
 
 
-def reported_table(page: Page) -> Table:
+def reported_table(page: Page, *, beside: int) -> Table:
     """Return the students' numbers next to the numbers from their data.
 
     For a wrong number, the table says what to look at. A number may be off by rounding, three
     standard errors and a few percent.
+
+    Parameters
+    ----------
+    beside : number of the table of parameters.
     """
-    lines = [
-        [
-            cell(name_span(row.name)),
-            cell(column),
-            cell(f"{yours:f}".replace("-", "−")),
-            cell(_of_column(row, column)),
-            cell(_unit(row)),
-            *_error_cells(row.name, yours, getattr(row, column)),
+    reported = page.analysis.reported
+    lines = []
+    for row in page.analysis.rows:
+        claimed = [
+            (reported.get("initial", {}).get(row.name), row.initial),
+            (reported.get("final", {}).get(row.name), row.final),
         ]
-        for column, claimed in page.analysis.reported.items()
-        for row in page.analysis.rows
-        if (yours := claimed.get(row.name)) is not None
-    ]
-    return page.table(_WORDS, "reported_table", lines, "llddldl")
+        if any(yours is not None for yours, _ in claimed):
+            cells = [one for yours, found in claimed for one in _claim(row.name, yours, found)]
+            off = any(yours is not None and is_off(row.name, yours, e) for yours, e in claimed)
+            look = _look_at(row.name) if off else ""
+            lines.append([cell(name_span(row.name)), cell(_unit(row)), *cells, cell(look)])
+    return page.table(_WORDS, "reported_table", lines, "llddlddll", table=beside)
 
 
-def _error_cells(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cell, Cell]:
-    """Return the error of a number and, if the error is too large, what to look at."""
+def _claim(name: str, yours: Decimal | None, found: Estimate | None) -> list[Cell]:
+    """Return a student's number, the number from the data, and their difference."""
+    value = NOTHING
+    if found is not None:
+        digits = 2 if found.source == "assumed" else 4
+        value = significant(found.value, digits=digits)
+    if yours is None:
+        return [cell(NOTHING, "quiet"), cell(value), cell(NOTHING, "quiet")]
+    text = cell(f"{yours:f}".replace("-", "−"))
     if found is None or not found.value or found.source == "assumed":
-        return cell(NOTHING, "quiet"), cell("")
-    share = percent(100 * (float(yours) - found.value) / abs(found.value), signed=True)
-    if not is_off(name, yours, found):
-        return cell(share), cell("")
+        return [text, cell(value), cell(NOTHING, "quiet")]
+    off = percent(100 * (float(yours) - found.value) / abs(found.value), signed=True)
+    return [text, cell(value), cell(off, "bad" if is_off(name, yours, found) else "")]
+
+
+def _look_at(name: str) -> str:
+    """Return what to look at if a number is wrong."""
     read = read_name(name)
     kinds = {"gain": read.is_gain, "damping": read.is_ratio, "frequency": read.is_frequency}
-    look = next((_WORDS.text(f"look_{kind}") for kind, is_it in kinds.items() if is_it), "")
-    return cell(share, "bad"), cell(look)
+    return next((_WORDS.text(f"look_{kind}") for kind, is_it in kinds.items() if is_it), "")
 
 
 def _parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:

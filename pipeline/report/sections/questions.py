@@ -18,7 +18,7 @@ from pipeline.report.sections.loops import CLOSE
 from pipeline.report.sections.notes import discussion_blocks, even_headings, named
 from pipeline.report.sections.parameters import source_text
 from pipeline.results import Analysis, HardwareCheck, ParameterRow
-from pipeline.words.numbers import count, listing, percent, significant
+from pipeline.words.numbers import listing, percent, significant
 from pipeline.words.phrases import phrases
 from pipeline.words.text import Span, clean, plain, rich
 
@@ -340,27 +340,24 @@ def open_questions(
     return [paragraph(raised)]
 
 
-def open_line(analysis: Analysis) -> str:
-    """Return a line for the terminal on questions that are still open; "" if none are."""
-    asked = ask(analysis)
-    answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), asked)
-    missing = [question.id for question in asked if question.id not in answers]
-    if not missing:
-        return ""
-    ids = ", ".join(f"“## {id_}”" for id_ in missing)
-    nearly = "".join(
-        f"; “## {heading}” answers none of them, did you mean “## {id_}”?"
-        for heading, id_ in _misspelt(rest, missing)
-    )
-    return f"{count(len(missing), 'question')} to answer in notes.md, under {ids}{nearly}"
+def unanswered(analysis: Analysis) -> list[Asked]:
+    """Return the questions that the students' notes do not answer."""
+    return _notes_on(analysis)[0]
 
 
-def _misspelt(notes: Iterable[Block], missing: Sequence[str]) -> Iterator[tuple[str, str]]:
+def misspelt_headings(analysis: Analysis, missing: Iterable[Asked]) -> Iterator[tuple[str, str]]:
     """Yield headings that are almost the id of an unanswered question, each with this id."""
-    ids = {id_.lower(): id_ for id_ in missing}
-    for block in notes:
+    ids = {question.id.lower(): question.id for question in missing}
+    for block in _notes_on(analysis)[1]:
         if isinstance(block, Heading):
             heading = plain(block.text)
             # A cutoff of 0.8 accepts one wrong character of five.
             for id_ in get_close_matches(named(heading), ids, n=1, cutoff=0.8):
                 yield heading, ids[id_]
+
+
+def _notes_on(analysis: Analysis) -> tuple[list[Asked], tuple[Block, ...]]:
+    """Return the unanswered questions, and the notes that answer no question."""
+    asked = ask(analysis)
+    answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), asked)
+    return [question for question in asked if question.id not in answers], rest

@@ -4,8 +4,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
-from pipeline.names import Name, read_name
-from pipeline.plant.limits import CALIBRATION
+from pipeline.names import MODES, read_name
 from pipeline.report.builder import Page
 from pipeline.report.document import (
     Block,
@@ -20,12 +19,14 @@ from pipeline.report.document import (
 from pipeline.report.sections.housekeeping import taken_text
 from pipeline.report.sections.loops import CLOSE
 from pipeline.report.sections.measurements import overview_blocks
+from pipeline.report.sections.questions import Asked, misspelt_headings, unanswered
 from pipeline.results import Analysis, Check, HardwareCheck, ParameterRow, Stage
 from pipeline.words.numbers import (
     NOTHING,
     count,
     listing,
     percent,
+    share,
     significant,
     unit_text,
     with_error,
@@ -85,11 +86,15 @@ class _Finding:
     tile: Tile | None = None
 
 
-def summary(page: Page) -> list[Block]:
+def summary(page: Page, *, open_questions: Sequence[Asked] = ()) -> list[Block]:
     """Return what was identified, what agrees, what does not, what is missing, and what to do next.
 
     Results are shown on boards of tiles. Problems are also described in sentences. One picture
     shows all carts.
+
+    Parameters
+    ----------
+    open_questions : the questions that the students have not answered.
     """
     analysis = page.analysis
     blocks: list[Block] = [_identified(analysis)]
@@ -99,23 +104,26 @@ def summary(page: Page) -> list[Block]:
         *_fit_tile(analysis),
         *(one.tile for one in findings if one.tile),
     ]
-    blocks += [Tiles(tiles) for tiles in (_numbers_board(analysis), tuple(verdicts)) if tiles]
+    if numbers := _numbers_board(analysis):
+        blocks += [Tiles(numbers, across=3), paragraph(_board_legend(analysis))]
+    blocks.append(Tiles(tuple(verdicts)))
     if problems := [one.text for one in findings if not one.good]:
         blocks.append(bullet_list(problems))
     blocks += overview_blocks(page)
-    return [*blocks, paragraph(Span(_WORDS.text("next"), "strong")), next_steps(analysis)]
+    steps = next_steps(analysis, open_questions=open_questions, has_links=True)
+    return [*blocks, paragraph(Span(_WORDS.text("next"), "strong")), steps]
 
 
 def terminal_summary(analysis: Analysis) -> str:
-    """Return the summary as a few lines of text."""
+    """Return the summary as lines of text: a paragraph, a finding or a step is one line."""
     numbers = [
-        f"{plain(tile.label)} = {plain(tile.value)} {plain(tile.note)}".rstrip()
-        for tile in _numbers_board(analysis, error="share")
+        f"{plain(tile.label)} = {plain(tile.value)} {tile.unit}".rstrip()
+        for tile in _numbers_board(analysis)
     ]
-    only = f" {_WORDS.text('statistical_only')}" if any("±" in text for text in numbers) else ""
-    it_has = [paragraph(f"It has {'; '.join(numbers)}.{only}")] if numbers else []
+    it_has = [paragraph(f"{_WORDS.text('it_has')} {'; '.join(numbers)}.")] if numbers else []
     findings = bullet_list(one.text for one in _findings(analysis))
-    next_ = [paragraph(f"{_WORDS.text('next')}."), next_steps(analysis)]
+    steps = next_steps(analysis, open_questions=unanswered(analysis))
+    next_ = [paragraph(f"{_WORDS.text('next')}."), steps]
     return plain_lines([_identified(analysis), *it_has, findings, *next_])
 
 
@@ -156,7 +164,6 @@ def _identified(analysis: Analysis) -> Block:
             fit=_WORDS.text("one_fit" if single else "joint_fit"),
             what=_WORDS.text(fit.method),
             points=str(fit.n_points),
-            chi_square=significant(fit.chi_square_per_dof, digits=3),
             quality=_WORDS.text("explained" if fit.explains_data else "unexplained")
             if fit.converged
             else "",
@@ -187,23 +194,40 @@ def _runs(analysis: Analysis, ids: Collection[str]) -> str:
     return listing([count(kinds[kind], noun) for kind, noun in _KINDS.items() if kinds[kind]])
 
 
-def _numbers_board(analysis: Analysis, *, error: str = "statistical") -> tuple[Tile, ...]:
-    """Return the gains and the resonances.
+@dataclass(frozen=True)
+class _NumberTile(Tile):
+    """A tile of a parameter; `unit` is its unit."""
 
-    Parameters
-    ----------
-    error : key of the note for a standard error below the accuracy of a calibration.
-    """
-    return tuple(
-        _number_tile(
-            row,
-            unit=unit_text(clean(row.unit)),
-            is_sure=_is_explained(analysis),
-            error=error,
-        )
+    unit: str = ""
+
+
+def _numbers_board(analysis: Analysis) -> tuple[_NumberTile, ...]:
+    """Return the gain, the resonance and its damping ratio of each cart or mode, row by row."""
+    n = analysis.bench.n
+    rows = [
+        row
         for row in analysis.rows
-        if row.final and (analysis.bench.n == 1 or _is_told(read_name(row.name)))
-    )
+        if row.final and (n == 1 or (name := read_name(row.name)).is_gain or name.is_mode)
+    ]
+    place = {row.name: i for i, row in enumerate(rows)}
+    order = sorted(rows, key=lambda row: (_mode(row.name), place[row.name]))
+    return tuple(_number_tile(row, is_sure=_is_explained(analysis)) for row in order)
+
+
+def _mode(name: str) -> int:
+    """Return the number of a mode or cart: 0 for "K_1" and "zeta_a"."""
+    read = read_name(name)
+    return (read.cart or 1) - 1 if read.is_gain else max(0, MODES.find(read.suffix))
+
+
+def _board_legend(analysis: Analysis) -> str:
+    """Return what the numbers on the board mean."""
+    shown = [row for row in analysis.rows if row.final]
+    both = any(row.initial for row in shown)
+    keys = ["board_both" if both else "board_final"]
+    if _is_explained(analysis):
+        keys.append("statistical_only")
+    return " ".join(_WORDS.text(key) for key in keys)
 
 
 def _is_explained(analysis: Analysis) -> bool:
@@ -211,32 +235,28 @@ def _is_explained(analysis: Analysis) -> bool:
     return analysis.fit is not None and analysis.fit.explains_data
 
 
-def _number_tile(row: ParameterRow, *, unit: str, is_sure: bool, error: str) -> Tile:
-    """Return a tile for a final number, with its standard error.
+def _number_tile(row: ParameterRow, *, is_sure: bool) -> _NumberTile:
+    """Return a tile with the initial and the final value, and the final one's error as a share.
 
-    An error below the accuracy of a calibration is stated in a note instead.
+    If the true error is unknown, the values have only three digits.
     """
-    final = row.final
+    final, initial, unit = row.final, row.initial, unit_text(clean(row.unit))
     assert final is not None
-    share = (final.std or 0.0) / abs(final.value) if final.value else 1.0
+    digits, notes = 3, [unit]
     if row.extrapolated:
-        value = significant(final.value, digits=3)
-        unit = f"{unit}, {_WORDS.text('extrapolated')}"
-    elif not is_sure:
-        # The true error is unknown, so the value has only three digits.
-        value = significant(final.value, digits=3)
-    elif 0 < share < CALIBRATION:
-        value = significant(final.value)
-        accuracy = _WORDS.text(error, share=f"{significant(100 * share, digits=1)} %")
-        unit = f"{unit}, {accuracy}" if unit else accuracy
-    else:
-        # If the error is 1 % or more, the value has about four digits when the error has two.
-        value = with_error(final.value, final.std, digits=2 if share >= 0.01 else 1)
-    return Tile(label=spans(name_span(row.name)), value=spans(value), note=spans(unit))
-
-
-def _is_told(name: Name) -> bool:
-    return name.is_gain or (name.is_frequency and name.is_mode)
+        notes.append(_WORDS.text("extrapolated"))
+    elif is_sure and final.std and final.value:
+        digits = 4
+        notes.append(f"± {share(final.std / abs(final.value))}")
+    value = significant(final.value, digits=digits)
+    if initial is not None:
+        is_guess = initial.source == "assumed"
+        value = f"{significant(initial.value, digits=2 if is_guess else digits)} → {value}"
+        if is_guess:
+            notes.append(_WORDS.text("guessed"))
+    return _NumberTile(
+        spans(name_span(row.name)), spans(value), spans(", ".join(filter(None, notes))), unit=unit
+    )
 
 
 def _status_tile(analysis: Analysis) -> Tile:
@@ -247,15 +267,14 @@ def _status_tile(analysis: Analysis) -> Tile:
 
 
 def _fit_tile(analysis: Analysis) -> list[Tile]:
-    """Return whether the model explains the data, with a link to the figures that show it."""
-    fit = analysis.fit
-    if fit is None:
+    """Return how much of the motion the model leaves, with a link to the figures that show it."""
+    fit, left = analysis.fit, analysis.unexplained_share
+    if fit is None or left is None:
         return []
     good = fit.converged and fit.explains_data
     url = "#frequency-response" if analysis.frequency_responses else "#parameters"
-    value = significant(fit.chi_square_per_dof, digits=3)
     note = _WORDS.text("tile_explained" if good else "tile_unexplained")
-    return [_tile("tile_chi_square", value, note, good=good, url=url)]
+    return [_tile("tile_fit", share(left), note, good=good, url=url)]
 
 
 def _tile(key: str, value: str, note: str, *, good: bool, url: str) -> Tile:
@@ -418,10 +437,34 @@ def _carts(carts: list[int]) -> str:
 # ------------------------------------------------------------------------------- what to do next
 
 
-def next_steps(analysis: Analysis) -> Items:
-    """Return what to do about every failed check, the most serious first, and further advice."""
-    failed, advice = list(_failed(analysis)), list(_advice(analysis))
-    return bullet_list([*failed, *advice] or [_nothing_left(analysis)])
+def next_steps(
+    analysis: Analysis, *, open_questions: Sequence[Asked] = (), has_links: bool = False
+) -> Items:
+    """Return what to do about every failed check, the most serious first, and further advice.
+
+    Parameters
+    ----------
+    open_questions : the questions that the students have not answered.
+    has_links : whether the questions are on the same page.
+    """
+    steps = [*_failed(analysis), *_advice(analysis)]
+    if open_questions:
+        steps.append(_to_answer(analysis, open_questions, has_links=has_links))
+    return bullet_list(steps or [_nothing_left(analysis)])
+
+
+def _to_answer(analysis: Analysis, asked: Sequence[Asked], *, has_links: bool) -> Spans:
+    """Return which questions to answer, and which headings of the notes nearly name one."""
+    ids: list[Span] = []
+    for one in asked:
+        url = f"#question-{one.id}" if has_links else ""
+        ids += [Span(", " if ids else ""), Span(one.id, "code", url=url)]
+    nearly = "".join(
+        _WORDS.text("next_misspelt", heading=clean(heading), id=id_)
+        for heading, id_ in misspelt_headings(analysis, asked)
+    )
+    questions = count(len(asked), "question")
+    return _WORDS.spans("next_answer", questions=questions, ids=tuple(ids), nearly=nearly)
 
 
 def _failed(analysis: Analysis) -> Iterator[Spans]:
