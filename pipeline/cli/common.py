@@ -64,6 +64,7 @@ app = typer.Typer(
 
 FIRST_WORD, _LAST_PAUSE = 2.0, 60.0  # s between messages: the first pause, and the longest
 PIPE_WIDTH = 80  # characters in a line that is not for a terminal
+_JOINT, _UNBROKEN = re.compile(r" (?=[=→])|(?<=[=→]) "), "\u00a0"
 _SENTENCE = re.compile(r".+?[.?!](?= [A-Z]|$)")
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A submission folder.")]
@@ -174,8 +175,8 @@ def _first_sentence(paragraph: str) -> str:
 def _wrapped(paragraph: str, *, width: int, most: int) -> list[str]:
     """Return a paragraph in at most `most` lines, without breaking names and paths."""
     item = paragraph.startswith("- ")
-    return textwrap.wrap(
-        paragraph,
+    lines = textwrap.wrap(
+        _JOINT.sub(_UNBROKEN, paragraph),
         width,
         subsequent_indent="  " if item else "",
         break_long_words=False,
@@ -183,6 +184,7 @@ def _wrapped(paragraph: str, *, width: int, most: int) -> list[str]:
         max_lines=most if item else None,
         placeholder=" …",
     )
+    return [line.replace(_UNBROKEN, " ") for line in lines]
 
 
 def _lists(paragraphs: Sequence[str]) -> list[list[int]]:

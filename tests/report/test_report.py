@@ -132,7 +132,7 @@ def printed(*sections: Section) -> list[str]:
     return [page.extract_text() for page in pypdf.PdfReader(io.BytesIO(render_pdf(document))).pages]
 
 
-@pytest.mark.parametrize("rows", [18, 30, 40])
+@pytest.mark.parametrize("rows", [24, 30, 40])
 def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
     """A table longer than a page breaks, and its heading stays with its first rows."""
     body = tuple((cell(f"row-{i:02d}"), cell("Dry friction holds it. " * 24)) for i in range(rows))
