@@ -535,13 +535,14 @@ def test_the_summary_of_a_good_result_is_short():
     checks = tuple(check for check in analysis.checks if check.outcome == "pass")
     points = tuple(replace(point, settled=True) for point in analysis.sine_points)
     good = replace(analysis, rows=rows, checks=checks, sine_points=points, skipped=(), warnings=())
-    assert good.feedback is not None
+    feedback = good.feedback
+    assert feedback is not None
     asked = unanswered(good)
     assert asked
     unread = terminal_summary(good)
     answered = "".join(f"## {question.id}\n\nFriction.\n\n" for question in asked)
     good = replace(good, discussion=answered)
-    missed = replace(good.feedback, reachable=False, message="settling in 1 ms cannot be met")
+    missed = replace(feedback, reachable=False, message="settling in 1 ms cannot be met")
     worse = (good, replace(good, warnings=("odd",)), replace(good, feedback=missed))
     texts = [terminal_summary(one) for one in worse]
     assert len(texts[0].splitlines()) == min(len(text.splitlines()) for text in texts)
