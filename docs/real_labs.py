@@ -194,7 +194,7 @@ def rows(analysis: Analysis, gap: Gap) -> Iterator[str]:
         )
         yield f"- {found.effect.key.replace('_', ' ')}{place}: {values}"
     errors = f"{gap.baseline:.1%} → {gap.final:.1%} of the motion ({gap.verdict})"
-    yield f"- error on held-out runs, linear model → with effects: {errors}"
+    yield f"- error on held-out recordings, linear model → with effects: {errors}"
     repeats = gap.repeatability
     spread = f"; difference between repeats: {repeats:.1%}" if repeats else ""
     yield f"- noise: {100 * gap.noise_floor:.2g}%{spread}"

@@ -157,7 +157,7 @@ def report(
     ] = False,
     plots: Annotated[
         bool,
-        typer.Option("--plots", help="Write compare.html too: plots of all runs and models."),
+        typer.Option("--plots", help="Write compare.html too: plots of all recordings and models."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -328,7 +328,7 @@ def gap(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find and name what the linear model leaves out, and test it on held-out runs."""
+    """Find and name what the linear model leaves out, and test it on held-out recordings."""
     with progress_line() as progress:
         text, told = explain(
             folder, out=out, budget=budget, pdf=pdf, model=model, progress=progress

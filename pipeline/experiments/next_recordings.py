@@ -457,7 +457,7 @@ def _percent(share: float) -> str:
 # rounding error is the same in many samples.
 _WHY_WORSE = (
     "the fit would be worse: the rounding errors of encoders do not average out while carts rest, "
-    "or move by few counts; try a larger motion, or a shorter run"
+    "or move by few counts; try a larger motion, or a shorter recording"
 )
 
 

@@ -413,7 +413,10 @@ def recording_problems(
         yield "release", f"expected a cart that is free, found {recording.release}"
     yield from _time_problems(recording)
     if recording.duration > LONGEST_RUN:
-        yield "cycles", f"the run takes {recording.duration:,.0f} s; the limit is {LONGEST_RUN:g} s"
+        yield (
+            "cycles",
+            f"the recording takes {recording.duration:,.0f} s; the limit is {LONGEST_RUN:g} s",
+        )
     yield from _amplitude_problems(recording, limits, system)
     if (recording.kind == "sine") != (wave == "sine"):
         yield "wave", f'a dwell of kind "sine" and the wave "sine" go together, found {wave!r}'

@@ -395,7 +395,9 @@ class Search:
         as_repeats = baseline.error < limits.AS_REPEATS * study.repeatability
         if baseline.at_floor or quiet or as_repeats:
             return baseline, [baseline]
-        study.progress(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
+        study.progress(
+            f"linear model: error {baseline.error:.1%} of the motion on held-out recordings"
+        )
         return find_hypotheses(baseline, self._timed(study))
 
     def _try(self, study: Study, *, only_at_floor: bool = False) -> bool:

@@ -511,7 +511,7 @@ def error_table(page: Page, gap: Gap) -> Table:
         models.append((f"with {names}", group[-1].nrmse_after))
     limits = [("noise alone", gap.noise_floor)]
     if gap.repeatability is not None:
-        limits.append(("repeats of one run differ by", gap.repeatability))
+        limits.append(("repeats of one recording differ by", gap.repeatability))
     rows = [[cell(name), cell(share(error))] for name, error in models]
     rows += [[cell(name, "quiet"), cell(share(error), "quiet")] for name, error in limits]
     return page.table(WORDS, "error_table", rows, "ld")
