@@ -93,7 +93,7 @@ def walk(window: Any, url: str, packed: Path, *, doubtful: int) -> Walk:
     window.wait_for_selector("#teams, [role=alert]", timeout=_PATIENCE)
     done.grading = time.monotonic() - began
 
-    click(link="without a remark")
+    click(link="without a flag")
     click(button="Accept the ticked teams")
     click(link="Continue with")
     for n in range(doubtful):
@@ -102,7 +102,7 @@ def walk(window: Any, url: str, packed: Path, *, doubtful: int) -> Walk:
             fill("#why", "The unit was wrong, the method was right.")
             click(button="Save")
         click(button="Accept")
-    click(button="Let students read their feedback")
+    click(button="Publish grades")
     click(at="summary:text('To a learning platform')")
     done.clicks += 2  # to open the list, and to choose
     window.select_option("#lms", "moodle")

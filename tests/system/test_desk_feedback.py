@@ -71,8 +71,8 @@ def press(window, control, key: str = "Enter") -> None:
 def test_from_the_request_to_the_answer_by_keyboard(show, lab, tmp_path: Path):
     """By keyboard, a student asks about a grade, the TA answers, and the student reads it."""
     prof = show(f"{lab}/", extra_http_headers=named("prof"))
-    press(prof, prof.get_by_role("button", name="Let students read their feedback"))
-    expect(prof.get_by_role("status")).to_contain_text("Students can read their feedback.")
+    press(prof, prof.get_by_role("button", name="Publish grades"))
+    expect(prof.get_by_role("status")).to_contain_text("The grades are published.")
 
     student = show(f"{lab}/", size=PHONE, color_scheme="dark", extra_http_headers=named("s4"))
     expect(student.locator(".result")).to_have_text("16.99 of 20 points")
@@ -88,7 +88,7 @@ def test_from_the_request_to_the_answer_by_keyboard(show, lab, tmp_path: Path):
     assert fits(student)
 
     ada = show(f"{lab}/", extra_http_headers=named("Ada"))
-    press(ada, ada.get_by_role("link", name="1 request waits for another look"))
+    press(ada, ada.get_by_role("link", name="1 regrade request waits"))
     expect(ada.locator("article")).to_contain_text("Page 3 has the laws.")
     assert fits(ada)
     walk_to(ada, ada.get_by_role("combobox", name="Points"))

@@ -42,7 +42,7 @@ def test_the_grading_pages_are_accessible(show, tmp_path):
             folded.press("Enter")
         assert fits(window)
         with window.expect_navigation():
-            window.get_by_role("link", name="teams without a remark").click()
+            window.get_by_role("link", name="teams without a flag").click()
         expect(window.locator("[name=team]")).to_have_count(8)
         assert fits(window)
         window.go_back()
