@@ -1011,6 +1011,8 @@ class RecordingGroup:
     experiments: tuple[str, ...] = written()
     values: dict[str, float] = written("m_1, k_2, omega_1, …")
     std: dict[str, float] = written("standard errors")
+    label: str = written("the day or folder that only these recordings share", default="")
+    remark: str = written("why they may differ, and what to state then", default="")
 
 
 @result()

@@ -14,7 +14,7 @@ from pipeline.estimation.hardware_check import check_hardware
 from pipeline.estimation.state_feedback import design_feedback
 from pipeline.identify.assumptions import list_assumptions
 from pipeline.identify.findings import valid_records
-from pipeline.identify.fit import check_groups, find_groups
+from pipeline.identify.groups import check_groups, find_groups, name_groups
 from pipeline.identify.identify import compare_estimates, identify_with_rejection
 from pipeline.identify.log import Log
 from pipeline.identify.model_checks import (
@@ -47,7 +47,7 @@ from pipeline.results import (
     Stage,
 )
 from pipeline.submission import Design, Submission
-from pipeline.words.numbers import group_messages
+from pipeline.words.numbers import group_messages, join_names
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
 
@@ -91,9 +91,15 @@ def analyse(
     )
     groups: tuple[RecordingGroup, ...] = ()
     if not springs:
-        groups = find_groups(
-            found.fitted, decays=found.decays, records=used, rows=rows, bench=bench
+        groups = found.fitted.groups or find_groups(
+            found.fit,
+            fits=found.fitted.fits,
+            decays=found.decays,
+            records=used,
+            rows=rows,
+            bench=bench,
         )
+        groups = name_groups(groups, data.records)
     checks = (
         *springs,
         *check_groups(groups),
@@ -141,6 +147,9 @@ def _read(submission: Submission, *, log: Log) -> tuple[Ingested, tuple[Interven
         log.skip(Stage.READING, reason, run=name)
     log.warn([f"not used, because it cannot be read: {part.message}" for part in submission.unread])
     log.warn(reading_remarks(data, unit=submission.system.bench.units.position))
+    left_out = [one.id for one in submission.experiments if one not in submission.used]
+    if left_out:
+        log.warn([_WORDS.text("stated_left_out", runs=join_names(left_out))])
     interventions = find_interventions(data.records)
     log.warn(hand_remarks(interventions, records=data.records))
     return data, interventions

@@ -1,65 +1,48 @@
-"""Fit all carts at once, and find recordings that want different carts.
+"""Fit all carts at once.
 
-The fit is to the dwells, or to steps and sweeps if the dwells contradict them. Groups of recordings
-want different carts, for example, after masses were changed.
+The fit is to the dwells, or to steps and sweeps if the dwells contradict them.
 """
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.errors import DataError
 from pipeline.estimation.bode_fit import fit_bode
 from pipeline.estimation.estimates import (
-    SIGMA_LIMIT,
     motion_measured,
     points_measured,
     with_coverage,
 )
-from pipeline.estimation.parametrisation import Parametrisation
 from pipeline.estimation.record_fit import (
     RecordFit,
     find_correction,
     fit_detuned,
-    is_driven,
     most_are_consistent,
     record_fits,
 )
 from pipeline.estimation.sine import FEW_COUNTS
-from pipeline.estimation.time_fit import evaluate_chain, fit_records, open_window
+from pipeline.estimation.time_fit import fit_records
 from pipeline.identify.corrections import without_lone_factors
 from pipeline.identify.findings import by_kind
+from pipeline.identify.groups import find_setups, steps_disagree
 from pipeline.identify.log import Log
-from pipeline.names import own_zeta, read_name
+from pipeline.names import own_zeta
 from pipeline.results import (
-    EXPLAINED,
     ChainFit,
-    Check,
     Estimate,
     Finding,
     FrequencyResponse,
-    LogDecrement,
-    ParameterRow,
     Record,
     RecordingGroup,
     Stage,
 )
 from pipeline.setup import Setup
-from pipeline.words.numbers import join_names, listing, with_error
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("skipped")
-# Relative difference of a mass or spring that matters, and of a frequency, its square root.
-_DIFFERENT, _DETUNED = 0.05, 0.025
-_MOST_SEEDS = 8  # recordings from which a group is started
-_MOST_FAILED = 2  # recordings that no chain explains; after these, the carts are not linear
-_MOST_GROUPS = 3
-_ENOUGH = 0.9  # share of the driven recordings that must be in a group
-_FARTHER = 1.5  # times the motion of another group
-_MOST_DWELLS = 8  # dwells that are fitted if a group has no other recordings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,12 +55,15 @@ class Fitted:
     by_dwells : whether the fit uses dwells and the dwells follow it.
     conflict : the records that contradict each other, by id, with the reason. If nothing shows
         which of them are right, there is no fit.
+    groups : the groups of steps and sweeps that want different carts. If there are some, there is
+        no fit to them.
     """
 
     fit: ChainFit | None = None
     fits: Mapping[str, RecordFit] = field(default_factory=dict)
     by_dwells: bool = False
     conflict: Mapping[str, Finding] = field(default_factory=dict)
+    groups: tuple[RecordingGroup, ...] = ()
 
     def compared(self, records: Sequence[Record]) -> list[Record]:
         """Return the records that are compared with the fit."""
@@ -126,6 +112,9 @@ def fit_carts(
     dwells = [record for record in runs.used if record.kind == "sine"]
     if not timed or (bode and not dwells):
         return bode or Fitted()
+    if bode is None and (groups := _setups_apart(runs.driven, bench=bench)):
+        log.skip(Stage.FINAL_ESTIMATES, _WORDS.text("groups", count=len(groups)))
+        return Fitted(groups=groups)
     contrary = bode is not None and bool(_contrary_kinds(runs.used, bode))
     beyond = bode is not None and _misses_transients(bode, runs, dwells)
     doubted = contrary or beyond or (bode is not None and _is_doubted(bode, dwells))
@@ -154,6 +143,11 @@ def fit_carts(
     used = " and ".join(noun for kind, noun in nouns.items() if kind in kinds)
     log.warn([_WORDS.text("fit_rests_on_whole" if beyond else "fit_rests_on", kinds=used)])
     return other
+
+
+def _setups_apart(driven: Sequence[Record], *, bench: Setup) -> tuple[RecordingGroup, ...]:
+    """Return the groups of records that no fit can unite; the search is quick."""
+    return find_setups(driven, bench=bench) if steps_disagree(driven) else ()
 
 
 def _is_seen(cart: int, records: Sequence[Record], responses: Sequence[FrequencyResponse]) -> bool:
@@ -296,201 +290,3 @@ def _conflict(
         for r in held
         if r.kind in mine ^ theirs
     }
-
-
-def find_groups(
-    fitted: Fitted,
-    *,
-    decays: Sequence[LogDecrement],
-    records: Sequence[Record],
-    rows: Sequence[ParameterRow],
-    bench: Setup,
-) -> tuple[RecordingGroup, ...]:
-    """Return the groups of recordings that want different carts, the largest first.
-
-    There are groups only if the carts of each group explain its recordings down to the noise, and
-    no set of carts explains them all. With hidden physics, a residual remains. If the
-    driven recordings follow a fit that explains its data, only the decays are compared with it.
-    """
-    fit, fits = fitted.fit, fitted.fits
-    explained = fit if fit and fit.converged and fit.explains_data else None
-    driven = [r for r in records if is_driven(r) and len(r.free) == len(r.carts) == bench.n]
-    one = explained and all(fits[r.id].chi_square <= EXPLAINED for r in driven if r.id in fits)
-    groups = [] if one else _driven_groups(driven, start=explained, bench=bench)
-    if told := _described(groups):
-        return told
-    if explained and all(fits[r.id].is_consistent for r in records if r.id in fits):
-        return _against_decays(explained, decays=decays, rows=rows)
-    return ()
-
-
-def _driven_groups(
-    driven: Sequence[Record], *, start: ChainFit | None, bench: Setup
-) -> list[tuple[list[Record], ChainFit]]:
-    """Return groups of driven recordings with the carts that explain each; none if they are one."""
-    groups: list[tuple[list[Record], ChainFit]] = []
-    rest = list(driven)
-    while rest and len(groups) < _MOST_GROUPS:
-        members, fit = _largest(rest, start=start, bench=bench)
-        own = fit if fit is start else _fit(members, bench=bench)
-        if own is None or not (own.converged and own.explains_data):
-            break
-        groups.append((members, own))
-        rest = [record for record in rest if record not in members]
-    most = len(rest) <= (1 - _ENOUGH) * len(driven)
-    return groups if most and _overlap([members for members, _ in groups]) else []
-
-
-def check_groups(groups: Sequence[RecordingGroup]) -> list[Check]:
-    """Return a failed check if groups of recordings want different carts."""
-    if not groups:
-        return []
-    told = []
-    for group in groups:
-        values = [f"{k} = {with_error(v, group.std.get(k))}" for k, v in group.values.items()]
-        told.append(f"{join_names(list(group.experiments))}: {listing(values)}")
-    details = {"groups": "; ".join(told)}
-    finding = Finding(code="groups", kind="groups", details=details, value=len(groups), limit=1)
-    return [finding.check]
-
-
-def _against_decays(
-    fit: ChainFit, *, decays: Sequence[LogDecrement], rows: Sequence[ParameterRow]
-) -> tuple[RecordingGroup, ...]:
-    """Return the fitted recordings and the decays, if these want other masses or springs.
-
-    The springs are the same if all static gains agree. Other decays than exponential ones
-    prove nothing.
-    """
-    gains = [row.consistent for row in rows if read_name(row.name).is_gain]
-    bent = {d.experiment for d in decays if not d.law.is_exponential}
-    pairs = {
-        row.name: (row.initial, row.final)
-        for row in rows
-        if read_name(row.name).is_frequency
-        if abs(row.change_percent or 0.0) > 100 * _DETUNED
-        if row.change_sigmas is not None and row.change_sigmas > SIGMA_LIMIT
-        if row.initial and row.initial.source == "log_decrement" and row.final
-        if not bent & set(row.initial.experiments)
-    }
-    if not pairs or not all(gains):
-        return ()
-    swings = dict.fromkeys(run for one, _ in pairs.values() for run in one.experiments)
-    return tuple(
-        RecordingGroup(
-            experiments=runs,
-            values={name: pair[i].value for name, pair in pairs.items()},
-            std={name: std for name, pair in pairs.items() if (std := pair[i].std) is not None},
-        )
-        for i, runs in ((1, fit.experiments), (0, tuple(swings)))
-    )
-
-
-def _largest(
-    rest: Sequence[Record], *, start: ChainFit | None, bench: Setup
-) -> tuple[list[Record], ChainFit | None]:
-    """Return the largest group of recordings that follow one fit, and this fit."""
-    largest: list[Record] = []
-    best: ChainFit | None = None
-    followed: set[str] = set()
-    for fit in _fits(rest, followed, start=start, bench=bench):
-        own = [record for record in rest if _follows(record, fit)]
-        followed |= {record.id for record in own}
-        if len(own) > len(largest):
-            largest, best = own, fit
-    return largest, best
-
-
-def _fits(
-    rest: Sequence[Record], followed: set[str], *, start: ChainFit | None, bench: Setup
-) -> Iterator[ChainFit]:
-    """Yield fits that recordings may follow: `start`, then those of single recordings.
-
-    Recordings that are in `followed` by then are skipped. So are those that no chain explains. A
-    single dwell does not determine the carts, so dwells are fitted together.
-    """
-    if start is not None:
-        yield start
-    whole = [record for record in rest if record.kind != "sine"][:_MOST_SEEDS]
-    failed = 0
-    for seed in [[record] for record in whole] or [rest]:
-        if any(record.id in followed for record in seed):
-            continue
-        fit = _fit(seed, bench=bench)
-        if fit and fit.explains_data:
-            yield fit
-        else:
-            failed += 1
-        if failed == _MOST_FAILED:
-            return
-
-
-def _follows(record: Record, fit: ChainFit) -> bool:
-    """Return whether a recording follows a fit within the noise and the errors of the fit."""
-    chain = fit.chain
-    every = Parametrisation(bench=Setup(springs=tuple(bool(k) for k in chain.k)))
-    sizes = zip(every.names, every.physical(chain), strict=True)
-    P = replace(every, zero=tuple(name for name, size in sizes if not size > 0))
-    try:
-        attempt = evaluate_chain([open_window(record)], P, P.pack(chain))
-    except DataError:  # nothing moves
-        return True
-    (misfit,) = attempt.misfits
-    slopes = (misfit.jacobian / P.dp_dtheta(attempt.theta)[:, None, None]).reshape(len(P.names), -1)
-    known = [name for name in P.names if name in fit.names]
-    at, of = [P.names.index(x) for x in known], [fit.names.index(x) for x in known]
-    doubt = np.sum(slopes[at] * (fit.covariance[np.ix_(of, of)] @ slopes[at]))
-    # The doubt is the expected χ² due to the errors of the fit; few of them make up most of it.
-    return bool(attempt.cost <= EXPLAINED * attempt.n_points + SIGMA_LIMIT**2 * doubt)
-
-
-def _fit(members: Sequence[Record], *, bench: Setup) -> ChainFit | None:
-    whole = [record for record in members if record.kind != "sine"]
-    dwells = members[:: 1 + len(members) // _MOST_DWELLS]
-    try:
-        return fit_records(whole or dwells, bench=bench)
-    except DataError:
-        return None
-
-
-def _overlap(groups: Sequence[Sequence[Record]]) -> bool:
-    """Return whether no group moves far more, or far less, than another one does.
-
-    With a spring that stiffens, small and large motion want different carts too.
-    """
-    sizes = [[float(np.ptp(record.position(1))) for record in members] for members in groups]
-    return all(min(a) <= _FARTHER * max(b) for a in sizes for b in sizes)
-
-
-def _described(groups: Sequence[tuple[Sequence[Record], ChainFit]]) -> tuple[RecordingGroup, ...]:
-    """Return the groups with the numbers that differ, if any do."""
-    if len(groups) < 2:
-        return ()
-    fits = [fit for _, fit in groups]
-    values = [_physical(fit) for fit in fits]
-    first, std = values[0], fits[0].std
-    known = [name for name in first if all(name in one for one in values)]
-    different = dict.fromkeys(
-        name
-        for name in known
-        for one, fit in zip(values[1:], fits[1:], strict=True)
-        if abs(one[name] - first[name])
-        > max(SIGMA_LIMIT * np.hypot(fit.std[name], std[name]), _DIFFERENT * abs(first[name]))
-    )
-    if not different:
-        return ()
-    return tuple(
-        RecordingGroup(
-            experiments=tuple(record.id for record in members),
-            values={name: one[name] for name in different},
-            std={name: fit.std[name] for name in different},
-        )
-        for (members, fit), one in zip(groups, values, strict=True)
-    )
-
-
-def _physical(fit: ChainFit) -> dict[str, float]:
-    """Return the masses and springs of a fit that have a standard error."""
-    rows = {"m": fit.chain.m, "k": fit.chain.k}
-    values = {f"{s}_{i}": float(v) for s, row in rows.items() for i, v in enumerate(row, start=1)}
-    return {name: value for name, value in values.items() if name in fit.std}

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array
 from pipeline.ingest.table import Note
 
+_FEWEST_COUNTS = 100  # a set point in counts
 _MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over its travel
 
 
@@ -40,6 +41,21 @@ def encoder_step(x: Array) -> float:
 def little_motion(ranges: Mapping[int, float]) -> tuple[int, ...]:
     """Return the carts that move less than 5 % as far as another cart, from their ranges."""
     return tuple(cart for cart, range_ in ranges.items() if range_ < 0.05 * max(ranges.values()))
+
+
+def settles_at_input(u: Array, x: Array) -> bool:
+    """Return whether a position in counts settles at the number in the input column.
+
+    Under feedback, it does so if the column holds the set point. In open loop, this is chance.
+    """
+    edges = find_edges(u)
+    if not 0 < edges.size <= 20 or np.any(u % 1) or np.any(x % 1):
+        return False
+    pieces = np.split(np.arange(u.size), edges)
+    rest, moved = pieces[0], max(pieces[1:], key=lambda piece: abs(u[piece[0]] - u[0]) * piece.size)
+    step = float(u[moved[0]] - u[0])
+    settled = float(np.mean(x[moved[-(moved.size // 4 + 1) :]]) - np.median(x[rest]))
+    return abs(step) >= _FEWEST_COUNTS and abs(abs(settled / step) - 1) < 0.03
 
 
 def mirrors(reference: Array, x1: Array) -> bool:

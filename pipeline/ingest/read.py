@@ -70,6 +70,7 @@ def read_data(submission: Submission) -> Ingested:
             f"{submission.folder.resolve().name}/submission.toml: it has no [[experiments]] "
             f"table yet; add one for each data file, as `cartlab fill` does"
         )
+    experiments = submission.used
     system, taken = submission.system, {experiment.file for experiment in submission.experiments}
     tables: dict[str, tuple[list[FileTable], str]] = {}
     opened: list[_Opened] = []
@@ -77,7 +78,7 @@ def read_data(submission: Submission) -> Ingested:
     warnings: list[str] = []
     unreadable: dict[str, str] = {}
     tables_read: list[str] = []
-    for experiment in submission.experiments:
+    for experiment in experiments:
         with _noted(experiment, unreadable):
             if experiment.file not in tables:
                 tables[experiment.file] = read_tables(
@@ -103,7 +104,7 @@ def read_data(submission: Submission) -> Ingested:
     for one, clock in zip(opened, clocks, strict=True):
         with _noted(one.experiment, unreadable):
             records.append(_read_record(one, clock))
-    if len(unreadable) == len(submission.experiments):
+    if len(unreadable) == len(experiments):
         (name, reason), *others = unreadable.items()
         raise SubmissionError(f"{name}: {reason}{f' (and {len(others)} more)' if others else ''}")
     per_count = system.input.per_count

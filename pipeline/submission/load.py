@@ -7,6 +7,7 @@ import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
+from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -295,6 +296,11 @@ def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, 
         seen.setdefault(experiment.id, i)
         for key, what in _experiment_problems(experiment, n, folder):
             yield ("experiments", i, *key), what
+    for i, pattern in enumerate(submission.leave_out):
+        if not any(fnmatchcase(name, pattern) for name in seen):
+            yield ("leave_out", i), f"{quote(pattern)} names no experiment{nearest(pattern, seen)}"
+    if submission.experiments and not submission.used:
+        yield ("leave_out",), "leaves out every experiment"
     yield from _reported_problems(submission)
 
 

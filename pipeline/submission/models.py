@@ -4,6 +4,7 @@ The desk's form shows the title and the description of each key.
 """
 
 from decimal import Decimal
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -309,11 +310,25 @@ class Submission(TomlTable):
     system: System
     design: Design | None = None
     experiments: Annotated[tuple[Experiment, ...], Field(max_length=MOST_EXPERIMENTS)] = ()
+    leave_out: tuple[Line, ...] = Field(
+        default=(),
+        title="Recordings that are not used",
+        description="ids of experiments, or patterns such as 14-Feb-*",
+    )
     reported: Reported | None = None
     students: Students = Students()
     folder: Path = Field(default=Path(), exclude=True)
     discussion: str | None = Field(default=None, exclude=True)
     unread: tuple[Unread, ...] = Field(default=(), exclude=True)
+
+    @property
+    def used(self) -> tuple[Experiment, ...]:
+        """The experiments that `leave_out` does not name."""
+        return tuple(
+            one
+            for one in self.experiments
+            if not any(fnmatchcase(one.id, pattern) for pattern in self.leave_out)
+        )
 
     @property
     def typed(self) -> dict[str, dict[str, Decimal]]:
