@@ -27,7 +27,6 @@ from pipeline.estimation.sine import FEW_COUNTS
 from pipeline.estimation.time_fit import fit_records
 from pipeline.identify.corrections import without_lone_factors
 from pipeline.identify.findings import by_kind
-from pipeline.identify.groups import find_setups, steps_disagree
 from pipeline.identify.log import Log
 from pipeline.names import own_zeta
 from pipeline.results import (
@@ -112,9 +111,6 @@ def fit_carts(
     dwells = [record for record in runs.used if record.kind == "sine"]
     if not timed or (bode and not dwells):
         return bode or Fitted()
-    if bode is None and (groups := _setups_apart(runs.driven, bench=bench)):
-        log.skip(Stage.FINAL_ESTIMATES, _WORDS.text("groups", count=len(groups)))
-        return Fitted(groups=groups)
     contrary = bode is not None and bool(_contrary_kinds(runs.used, bode))
     beyond = bode is not None and _misses_transients(bode, runs, dwells)
     doubted = contrary or beyond or (bode is not None and _is_doubted(bode, dwells))
@@ -143,11 +139,6 @@ def fit_carts(
     used = " and ".join(noun for kind, noun in nouns.items() if kind in kinds)
     log.warn([_WORDS.text("fit_rests_on_whole" if beyond else "fit_rests_on", kinds=used)])
     return other
-
-
-def _setups_apart(driven: Sequence[Record], *, bench: Setup) -> tuple[RecordingGroup, ...]:
-    """Return the groups of records that no fit can unite; the search is quick."""
-    return find_setups(driven, bench=bench) if steps_disagree(driven) else ()
 
 
 def _is_seen(cart: int, records: Sequence[Record], responses: Sequence[FrequencyResponse]) -> bool:

@@ -29,6 +29,7 @@ from pipeline.identify.corrections import (
     standing_still,
 )
 from pipeline.identify.fit import Fitted, Runs, fit_carts
+from pipeline.identify.groups import find_setups, steps_disagree
 from pipeline.identify.log import Log, Measured
 from pipeline.identify.recording_checks import find_shown
 from pipeline.identify.repeats import Repeats, compare_repeats, find_outlier_repeats
@@ -44,6 +45,7 @@ from pipeline.results import (
     LogDecrement,
     ParameterRow,
     Record,
+    RecordingGroup,
     SinePoint,
     Skipped,
     Stage,
@@ -116,12 +118,19 @@ def identify(
     short = [r for r in used if r.id in ended_early and len(r.free) == bench.n]
     runs = replace(runs, short=short)
     progress("frequency response")
-    responses = _frequency_response(data, sines=sines, runs=runs, log=log)
+    groups = _setups_apart(data, sines=sines, runs=runs, bench=bench)
+    if groups:
+        for stage in (Stage.FREQUENCY_RESPONSE, Stage.FINAL_ESTIMATES):
+            log.skip(stage, _WORDS.text("groups", count=len(groups)))
+    responses = () if groups else _frequency_response(data, sines=sines, runs=runs, log=log)
     resonances = _resonances(responses, bench=bench, log=log)
     alone = estimate_initially(carts=bench.n, log_decrements=decays, step_gains=gains)
 
     progress("fitting all carts at once")
-    fitted = fit_carts(responses, runs=runs, initial={**resonances, **alone}, bench=bench, log=log)
+    fitted = Fitted(groups=groups)
+    if not groups:
+        initial = {**resonances, **alone}
+        fitted = fit_carts(responses, runs=runs, initial=initial, bench=bench, log=log)
     parameters = fitted.fit.parameters if fitted.fit and fitted.fit.converged else {}
     dwells = parameters if fitted.by_dwells else {}
     repeats = compare_repeats(decays, gains, carts=bench.n, fitted=parameters, dwells=dwells)
@@ -262,6 +271,15 @@ def _sine_points(records: Sequence[Record], *, log: Log) -> list[SinePoint]:
             elif point:
                 points.append(point)
     return points
+
+
+def _setups_apart(
+    data: Ingested, *, sines: Sequence[SinePoint], runs: Runs, bench: Setup
+) -> tuple[RecordingGroup, ...]:
+    """Return the groups of steps and sweeps that no fit can unite, if no dwells decide."""
+    if data.tables or any(point.settled for point in sines) or not steps_disagree(runs.driven):
+        return ()
+    return find_setups(runs.driven, bench=bench)
 
 
 def _frequency_response(
