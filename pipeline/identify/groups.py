@@ -315,13 +315,11 @@ def find_setups(driven: Sequence[Record], *, bench: Setup) -> tuple[RecordingGro
 
 
 def steps_disagree(driven: Sequence[Record]) -> bool:
-    """Return whether carts move much farther in some steps than in others, per unit of input."""
-    ratios = [
-        float(np.ptp(record.position(1)) / np.ptp(record.u))
-        for record in driven
-        if record.kind == "step" and is_driven(record) and record.u is not None
-    ]
-    return len(ratios) > 3 and max(ratios) > _OTHER_GAIN * min(ratios)
+    """Return whether carts move much farther in some steps than in others, or only in some."""
+    steps = [record for record in driven if record.kind == "step" and is_driven(record)]
+    ratios = [np.ptp(r.position(1)) / np.ptp(r.u) for r in steps if r.u is not None]
+    apart = len(ratios) > 3 and max(ratios) > _OTHER_GAIN * min(ratios)
+    return bool(apart) or len({_seems_held(record) for record in steps}) > 1
 
 
 def _seems_held(record: Record) -> tuple[int, ...]:
@@ -338,7 +336,7 @@ def _setups(records: Sequence[Record], held: tuple[int, ...], *, bench: Setup) -
     """Return the set-ups among recordings in which the same carts hardly move."""
     n = held[0] - 1 if held else bench.n
     # Of two springs on one cart, only the sum shows.
-    springs = bench.springs if not held else (*bench.springs[:n], n > 1 and bench.springs[n])
+    springs = bench.springs[: n + 1] if n > 1 or not held else (True, False)
     part = replace(bench, springs=springs)
     rest = [_only(record, n) for record in records]
     setups: list[_Setup] = []
@@ -375,7 +373,7 @@ def _with_stragglers(setups: Sequence[_Setup], rest: Sequence[Record]) -> list[_
     joined = list(setups)
     for record in rest:
         near = [i for i, fits in enumerate(shares) if record.id in fits]
-        near = [i for i in near if shares[i][record.id].share <= _CONTRARY]
+        near = [i for i in near if not _is_contrary(shares[i][record.id])]
         alike = [i for i, program in enumerate(programs) if program and _is_at_input([record])]
         for home in (near, alike, range(len(setups)) if setups and setups[0].held else ()):
             if len(home) == 1:
@@ -417,28 +415,30 @@ def _quick_chain(record: Record, *, bench: Setup) -> Chain | None:
 def _contradict(one: _Setup, other: _Setup) -> bool:
     """Return whether no bench can be the cause of both set-ups, and no known mistake either."""
     pairs = [(a, b) for a in one.members for b in other.members]
-    comparable = any(
-        _farther_by_less(a, b)
-        or _farther_by_less(b, a)
-        or (_covers(a, b) and _covers(b, a))
-        or (a.kind != b.kind and one.held == other.held)
-        for a, b in pairs
-    )
-    if not comparable:
-        return False
+    less = any(_farther_by_less(a, b) or _farther_by_less(b, a) for a, b in pairs)
     if one.held != other.held:
-        return True
+        # A larger input would move a cart that only sticks.
+        fewer_held = len(one.held) < len(other.held)
+        return less or any(_covers(b, a) if fewer_held else _covers(a, b) for a, b in pairs)
+    if not less and not any(_covers(a, b) and _covers(b, a) for a, b in pairs):
+        return False
     sizes = [[float(np.ptp(r.position(1))) for r in x.members] for x in (one, other)]
     alike = all(min(a) <= _FARTHER * max(b) for a in sizes for b in sizes)
-    if not alike and not any(_farther_by_less(a, b) or _farther_by_less(b, a) for a, b in pairs):
+    if not alike and not less:
         return False
     for members, chain in ((other.members, one.chain), (one.members, other.chain)):
         fits = record_fits(members, chain)
-        if any(fit.share <= _CONTRARY for fit in fits.values()):
+        if not all(map(_is_contrary, fits.values())):
             return False
         if any(find_correction(r, chain, fits[r.id]) for r in members[:2] if r.id in fits):
             return False
     return True
+
+
+def _is_contrary(fit: RecordFit) -> bool:
+    """Return whether a chain and a record disagree, compared with the larger of their motions."""
+    farther = max(1.0, *fit.amplitude_ratio.values())
+    return fit.share * farther**2 > _CONTRARY
 
 
 def _covers(one: Record, other: Record) -> bool:

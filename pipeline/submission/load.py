@@ -298,7 +298,10 @@ def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, 
             yield ("experiments", i, *key), what
     for i, pattern in enumerate(submission.leave_out):
         if not any(fnmatchcase(name, pattern) for name in seen):
-            yield ("leave_out", i), f"{quote(pattern)} names no experiment{nearest(pattern, seen)}"
+            yield (
+                ("leave_out", i),
+                f"{quote(pattern)} names no experiment{nearest(pattern, [*seen])}",
+            )
     if submission.experiments and not submission.used:
         yield ("leave_out",), "leaves out every experiment"
     yield from _reported_problems(submission)

@@ -6,7 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from pipeline.ingest.channels import encoder_step, mirrors, saturation, stuck_spans
+from pipeline.ingest.channels import (
+    encoder_step,
+    mirrors,
+    saturation,
+    settles_at_input,
+    stuck_spans,
+)
 
 RATE = 113.0
 T = np.arange(900, dtype=np.float64) / RATE
@@ -97,3 +103,15 @@ def test_steps_and_slow_approaches_are_not_clipped():
     """Steps and slow approaches to a value are not taken for clipping."""
     assert saturation(np.where(T > 1, 1.0, 0.0)) is None
     assert saturation((1 - np.exp(-2 * T)).round(4)) is None
+
+
+@pytest.mark.parametrize(
+    ("gain", "settles"), [(1.0, True), (-1.01, True), (1.1, False), (4.0, False)]
+)
+def test_a_set_point_in_the_input_column_is_seen(gain, settles):
+    """A cart that settles at the number in the input column may follow it as a set point."""
+    u = np.where((T > 1.0) & (T < 5.0), 1000.0, 0.0)
+    rise = np.exp(-3.0 * np.clip(T - 1.0, 0.0, 4.0)) * np.cos(20.0 * (T - 1.0))
+    x = np.round(gain * u * (1.0 - rise)) + 40.0
+    assert settles_at_input(u, x) == settles
+    assert not settles_at_input(u / 1000.0, x)

@@ -5,6 +5,7 @@ from decimal import Decimal
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -391,3 +392,44 @@ def test_only_the_first_of_many_mistakes_are_listed(tmp_path):
     with pytest.raises(InvalidSubmission, match="k0: ") as told:
         load_submission(tmp_path)
     assert len(str(told.value).split("\n")) == len(told.value.problems) == 20
+
+
+LEFT_OUT = """\
+version = 1
+leave_out = [{names}]
+[system]
+carts = 1
+[[experiments]]
+id = "14-Feb-a"
+kind = "decay"
+file = "a.csv"
+[[experiments]]
+id = "21-Feb-b"
+kind = "decay"
+file = "b.csv"
+"""
+
+
+@pytest.mark.parametrize(
+    ("names", "used"),
+    [
+        ("", ["14-Feb-a", "21-Feb-b"]),
+        ('"14-Feb-*"', ["21-Feb-b"]),
+        ('"21-Feb-b"', ["14-Feb-a"]),
+        ('"22-Feb-*"', None),
+        ('"*"', None),
+    ],
+)
+def test_experiments_can_be_left_out(tmp_path, names, used):
+    """Names and patterns in `leave_out` leave out experiments, but not none, and not all."""
+    (tmp_path / "submission.toml").write_text(LEFT_OUT.format(names=names), encoding="utf-8")
+    t = np.arange(300) / 100
+    for name in "ab":
+        rows = np.column_stack([t, np.round(np.exp(-t) * np.cos(20 * t), 4)])
+        np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header="time,x1", comments="")
+    if used is None:
+        with pytest.raises(InvalidSubmission, match="leave_out"):
+            load_submission(tmp_path)
+    else:
+        data = read_data(load_submission(tmp_path))
+        assert [record.id for record in data.records] == used
