@@ -82,14 +82,6 @@ def test_a_day_with_another_amplifier_is_a_group(preset, seed):
     assert gains[1] / gains[0] == pytest.approx(2.0, rel=0.2)
 
 
-def test_a_day_with_another_mass_is_a_group():
-    """With a mass three times as large, and the same gain, each day is a group."""
-    chain = PRESETS["throne-2dof"]
-    other = replace(chain, m=chain.m * np.array([1.0, 3.0]))
-    records, bench = days(SimulatedBench(chain=chain), SimulatedBench(chain=other), seed=3)
-    assert_days_apart(records, bench)
-
-
 @pytest.mark.parametrize("preset", ["throne-2dof", "throne-3dof"])
 def test_a_day_with_a_held_cart_is_a_group(preset):
     """If the last cart, stated as free, was held on one day, that day's group says so."""
