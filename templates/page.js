@@ -52,7 +52,7 @@
     offer((b) => caption.append(b), caption.querySelector('b').textContent.replace('.', ''), () => asTabs(table));
   }
   for (const formula of document.querySelectorAll('[data-copy]'))
-    offer((b) => formula.after(b), 'the matrices', () => formula.dataset.copy);
+    offer((b) => formula.after(b), 'these numbers', () => formula.dataset.copy);
 
   const links = new Map([...document.querySelectorAll('nav a')].map((a) => [a.hash.slice(1), a]));
   const seen = new IntersectionObserver((entries) => {

@@ -161,20 +161,36 @@ def symbolic_transfer_functions(springs: Sequence[bool]) -> Formula | None:
 
 
 def numeric_transfer_functions(chain: Chain) -> Formula:
-    """Return X_i/U with numbers: as static gain and quadratic factors, or as polynomials.
+    """Return X_i/U with numbers, as static gain and quadratic factors; its copy has polynomials.
 
     A chain without a spring to a wall has no static gain, so its polynomials are shown.
     """
+    ratios = [chain.transfer_function(i) for i in range(1, chain.n + 1)]
+    copy = "\n".join(
+        [
+            matlab_matrix("D", ratios[0][1][None]),
+            *(
+                f"{matlab_matrix(f'N{i}', above[None])}\nG{i} = tf(N{i}, D);"
+                for i, (above, _) in enumerate(ratios, start=1)
+            ),
+        ]
+    )
     if not chain.is_tied:
-        return formula(lines(_polynomial_ratio(chain, i) for i in range(chain.n, 0, -1)))
+        numerators = [_polynomial(above) for above, _ in ratios]
+        below = [row(_polynomial(ratios[0][1]))]
+        return _over_common_denominator(numerators, [[]] * chain.n, below, copy=copy)
     gains = [_short(gain) for gain in chain.static_gains()]
     below = _numeric_factors(chain.poles)
     above = [_numeric_factors(chain.zeros(i)) for i in range(1, chain.n + 1)]
-    return _over_common_denominator(gains, above, below)
+    return _over_common_denominator(gains, above, below, copy=copy)
 
 
 def _over_common_denominator(
-    gains: Sequence[Term], above: Sequence[Sequence[Math]], below: Sequence[Math]
+    gains: Sequence[Term],
+    above: Sequence[Sequence[Math]],
+    below: Sequence[Math],
+    *,
+    copy: str = "",
 ) -> Formula:
     """Return every X_i/U, the last cart first, and then the common denominator D(s)."""
     D = row("D", parens("s"))
@@ -183,7 +199,7 @@ def _over_common_denominator(
         for i in range(len(gains), 0, -1)
     ]
     factors = below if len(below) == 1 else [parens(factor) for factor in below]
-    return formula(lines([*equations, row(D, "=", *factors)]))
+    return formula(lines([*equations, row(D, "=", *factors)]), copy=copy)
 
 
 def _ratio(i: int) -> Math:
@@ -218,11 +234,6 @@ def _factor(*terms: Term) -> Math:
 def _short(value: float) -> Term:
     exact = value in (0.0, 1.0, -1.0)
     return number(significant(float(value), digits=1 if exact else _DIGITS))
-
-
-def _polynomial_ratio(chain: Chain, cart: int) -> Math:
-    above, below = chain.transfer_function(cart)
-    return row(_ratio(cart), "=", fraction(_polynomial(above), _polynomial(below)))
 
 
 def _polynomial(coefficients: Array) -> Term:

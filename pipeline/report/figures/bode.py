@@ -11,7 +11,13 @@ from pipeline.arrays import Array
 from pipeline.names import mode_suffixes
 from pipeline.plant.chain import Chain
 from pipeline.report.figures import CARTS, MEASURED, MODEL, QUIET
-from pipeline.report.figures.style import legend_above, log_frequency_axis, panels, plot_line
+from pipeline.report.figures.style import (
+    DigitTicks,
+    legend_above,
+    log_frequency_axis,
+    panels,
+    plot_line,
+)
 from pipeline.results import FrequencyResponse
 from pipeline.setup import Units
 from pipeline.words.numbers import subscript
@@ -41,6 +47,8 @@ def bode_panels(response: FrequencyResponse, *, chain: Chain | None, units: Unit
     heights = [1.3, *([0.8] if has_phase else []), *([0.5] if chain else [])]
     figure, axes = panels(*heights)
     log_frequency_axis(axes[0], response.omega)
+    for lower in axes[1:]:
+        lower.add_artist(DigitTicks(lower, "x"))
     plot_magnitude(axes[0], response, chain=chain, units=units)
     if has_phase:
         plot_phase(axes[1], response, chain=chain)
