@@ -39,6 +39,7 @@ from pipeline.report.sections.measurements import (
     dwell_blocks,
     response_blocks,
     step_blocks,
+    sweep_blocks,
 )
 from pipeline.report.sections.notes import discussion_blocks, formula_problems
 from pipeline.report.sections.parameters import chain_table, parameter_blocks
@@ -103,6 +104,7 @@ def build_document(
         ("frequency-response", "Frequency response", response_blocks),
         ("decays", "Free decays", decay_blocks),
         ("steps", "Steps and static gains", step_blocks),
+        ("sweeps", "Sweeps", sweep_blocks),
         ("steady-state", "Sinusoidal steady state", dwell_blocks),
         ("feedback", "State feedback", feedback_blocks),
         (

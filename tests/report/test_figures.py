@@ -17,18 +17,20 @@ from hypothesis import strategies as st
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import PathPatch, Rectangle
 from matplotlib.text import Text
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.gap.residual import ResidualForce
 from pipeline.plant.chain import Chain
 from pipeline.report.builder import Page
+from pipeline.report.document import Table
 from pipeline.report.figures import CARTS, MEASURED, QUIET
 from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
 from pipeline.report.figures.gap import force_figure, force_left_figure, timing_figure
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import (
+    DigitTicks,
     drawing,
     log_scale,
     panels,
@@ -40,15 +42,23 @@ from pipeline.report.figures.style import (
     to_svg,
 )
 from pipeline.report.figures.time import (
+    HardwareRun,
     damping_figure,
     decay_figure,
     design_figure,
     hardware_figure,
     sine_figure,
     step_figure,
+    sweep_figure,
 )
-from pipeline.report.sections.measurements import dwell_blocks, response_blocks, step_blocks
-from pipeline.results import FrequencyResponse
+from pipeline.report.sections.loops import hardware_blocks
+from pipeline.report.sections.measurements import (
+    dwell_blocks,
+    response_blocks,
+    step_blocks,
+    sweep_blocks,
+)
+from pipeline.results import Analysis, FrequencyResponse, Record
 from pipeline.setup import PAPER_UNITS, Units
 from pipeline.words.numbers import significant
 from pipeline.words.text import plain
@@ -183,9 +193,9 @@ def test_an_unstable_model_does_not_hide_the_measurement():
     check = make_analysis(1).hardware[0]
     growth = np.append(np.exp(np.linspace(0, 700, check.t.size - 1)), np.inf)
     for model in (1e12 * check.model, growth):
-        grown = [[replace(check, model=model)]]
+        grown = HardwareRun(name="run", checks=[replace(check, model=model)])
         with drawing():
-            figure = hardware_figure(grown, record=None, units=PAPER_UNITS)
+            figure = hardware_figure([grown], units=PAPER_UNITS)
         drawn(figure)
         assert np.ptp(figure.axes[0].get_ylim()) <= 3.01 * np.ptp(check.measured)
 
@@ -307,6 +317,38 @@ def test_a_logarithmic_axis_has_round_numbers(limits, expected):
     assert [f"{one:g}" for one in labels(figure, ax)] == expected
 
 
+@pytest.mark.parametrize(
+    ("limits", "digits"),
+    [
+        ((0.4, 7.0), [0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1, 2, 3, 4, 5, 6, 7]),
+        ((8.0, 27.0), [8, 9, 10, 20]),
+    ],
+)
+@pytest.mark.parametrize("direction", ["x", "y"])
+def test_a_logarithmic_axis_has_ticks_at_all_digits(limits, digits, direction):
+    """A logarithmic axis has a tick at 1 to 9 times each power of ten, within its limits."""
+    with drawing():
+        figure, (ax,) = panels(2.0)
+        log_scale(ax, direction)
+        ax.set(**{f"{direction}lim": limits})
+        drawn(figure)
+    (ticks,) = (artist for artist in ax.get_children() if isinstance(artist, DigitTicks))
+    drawn_at, ends = np.asarray(ticks.get_path().vertices).T[:: 1 if direction == "x" else -1]
+    assert_allclose(drawn_at[::2], digits)
+    assert_allclose(drawn_at[1::2], digits)
+    assert not ends[::2].any()
+    assert np.all(ends[1::2] > 0)
+
+
+def test_every_panel_of_a_bode_figure_has_ticks_at_all_digits():
+    """Each panel of a Bode figure has ticks for reading frequencies."""
+    figure = bode(response_of(2, 1), carts=2)
+    drawn(figure)
+    for ax in figure.axes:
+        (ticks,) = (artist for artist in ax.get_children() if isinstance(artist, DigitTicks))
+        assert len(ticks.get_path().vertices) > 16
+
+
 def test_the_users_matplotlib_settings_do_not_matter():
     """The user's own matplotlib settings change no figure."""
     before = drawn(bode(response_of(2, 1), carts=2))
@@ -350,7 +392,11 @@ def figures_of(carts: int) -> dict[str, Figure]:
     own = [decay for decay in decays if decay.cart == 1]
     runs = list(dict.fromkeys(gain.experiment for gain in analysis.step_gains))
     dwell = analysis.sine_points[-1].experiment
-    checks = [[c for c in analysis.hardware if c.cart == cart] for cart in range(1, carts + 1)]
+    run = HardwareRun(name=long["control"], checks=analysis.hardware, record=analysis.records[-1])
+    models = {
+        records[run].id: {cart: records[run].position(cart) for cart in records[run].carts}
+        for run in runs
+    }
     assert analysis.feedback is not None
     # A force in volt is small, so its numbers are long.
     small = replace(RESIDUAL.against[0], force=(2.4e-3, -2.4e-3), spread=(1e-4, None), formula=None)
@@ -382,8 +428,14 @@ def figures_of(carts: int) -> dict[str, Figure]:
             [p for p in analysis.sine_points if p.experiment == dwell], record=records[dwell],
             position_unit="count",
         ),
-        "hardware": hardware_figure(
-            checks, record=analysis.records[-1], units=COUNTS
+        "hardware": hardware_figure([run], units=COUNTS),
+        "hardware, two runs": hardware_figure([run, replace(run, name="again")], units=COUNTS),
+        "fitted steps": step_figure(
+            [[g for g in analysis.step_gains if g.experiment == run] for run in runs],
+            records=[records[run] for run in runs], position_unit="count", models=models,
+        ),
+        "sweep": sweep_figure(
+            records[runs[0]], model=models[records[runs[0]].id], position_unit="count",
         ),
         "overview": overview_figure(
             analysis.frequency_responses, chain=analysis.chain, units=COUNTS,
@@ -445,12 +497,15 @@ LONG = "DOF1_en1_input1_trial_of_monday_"
     ("names", "titles"),
     [
         ([*"abcde"], [*"abcde"]),
-        ([f"{LONG}{i}" for i in range(6)], [f"…{i}" for i in range(6)]),
+        ([f"{LONG}{i}" for i in range(6)], [*"012345"]),
+        ([f"DOF1_en1_input1_test{i}" for i in range(5)], [f"test{i}" for i in range(5)]),
+        (["a" * 25, "b" * 25, "c" * 25], ["a" * 25, "b" * 25, "c" * 25]),
+        ([f"{'x' * 60}{i}" for i in range(3)], [f"{'x' * 12}…{'x' * 11}{i}" for i in range(3)]),
         (["step-1", "step-2"], ["step-1", "step-2"]),
     ],
 )
 def test_repeats_share_one_time_axis(names, titles):
-    """Panels of repeated runs share one time axis; long titles show only how they differ."""
+    """Panels of repeated runs share one time axis; long titles leave out words that all share."""
     with drawing():
         _, axes = small_multiples(names, height=1.0, share_y=True)
         axes[0].set_xlim(0, 3)
@@ -502,3 +557,155 @@ def test_the_count_axis_has_only_whole_numbers(points):
     numbers = labels(figure, figure.axes[0])
     assert len(numbers) >= 2
     assert all(number.is_integer() for number in numbers)
+
+
+# ------------------------------------------------------------ fitted recordings
+
+
+def points_of(ax: Axes) -> list[np.ndarray]:
+    """Return the measured points (n, 2) of each series that a panel shows."""
+    dots = [patch for patch in ax.get_children() if type(patch) is PathPatch]
+    return [np.asarray(patch.get_path().vertices)[::2] for patch in dots]
+
+
+def line_named(ax: Axes, name: str) -> Any:
+    """Return the line with points that has a name in the legend."""
+    (line,) = (one for one in ax.lines if one.get_label() == name and len(one.get_xdata()))
+    return line
+
+
+def swept(n: int = 4000) -> Record:
+    """Return a sweep of two carts whose swing is largest between 20 and 24 s."""
+    t = np.linspace(0.0, 40.0, n)
+    y = np.exp(-(((t - 22.0) / 4.0) ** 2)) * np.sin(2 * np.pi * t * (0.5 + t / 40.0))
+    return Record(
+        id="sweep", kind="sweep", t=t, u=np.sin(t), y=np.array([y, 0.5 * y]), carts=(1, 2),
+        free=(1, 2), resolution=np.zeros(2),
+    )  # fmt: skip
+
+
+def test_fitted_steps_have_the_models_line_over_few_points():
+    """The model's line of each cart is drawn as it is, over at most 120 measured points."""
+    analysis = make_analysis(3)
+    run = analysis.step_gains[0].experiment
+    gains = [gain for gain in analysis.step_gains if gain.experiment == run]
+    (record,) = (record for record in analysis.records if record.id == run)
+    model = {cart: record.position(cart) + 0.01 for cart in record.carts}
+    with drawing():
+        figure = step_figure([gains], records=[record], position_unit="cm", models={run: model})
+    (ax,) = figure.axes
+    shown = points_of(ax)
+    assert len(shown) == 3
+    for cart, points in zip(record.carts, shown, strict=True):
+        assert 60 < len(points) <= 120
+        at = np.searchsorted(record.t, points[:, 0] - 1e-9)
+        assert_allclose(points[:, 1], record.position(cart)[at])
+        line = line_named(ax, f"x{'₁₂₃'[cart - 1]}")
+        assert (line.get_color(), line.get_linestyle()) == CARTS[cart - 1][:2]
+        assert line.get_zorder() > 1.9  # the points
+        expected = np.interp(data(line, "x"), record.t, model[cart])
+        assert_allclose(data(line, "y"), expected, atol=1e-9)
+
+
+def test_a_fitted_sweep_shows_its_residual_and_its_largest_swing():
+    """Left: the whole sweep and its residual. Right: the cycles of the largest swing, legibly."""
+    record = swept()
+    model = {1: record.position(1) - 0.1, 2: record.position(2) + 0.2}
+    with drawing():
+        figure = sweep_figure(record, model=model, position_unit="cm")
+    assert len(figure.axes) == 4
+    for cart, residual in ((1, 0.1), (2, -0.2)):
+        whole, near = figure.axes[2 * cart - 2 : 2 * cart]
+        assert_allclose(data(line_named(whole, "residual"), "y"), residual)
+        assert np.ptp(data(line_named(whole, "motion"), "x")) > 39.0
+        (points,) = points_of(near)
+        assert points[0, 0] < 22.0 < points[-1, 0]
+        assert len(points) <= 200
+        line = line_named(near, "model")
+        assert_allclose(np.ptp(data(line, "x")), np.ptp(points[:, 0]), rtol=0.02)
+        crossings = np.count_nonzero(np.diff(np.signbit(points[:, 1])))
+        assert 15 <= crossings <= 25  # ten cycles
+
+
+def fitted_to(kind: str, *, method: str) -> Analysis:
+    """Return an analysis of two carts whose model was fitted to recordings of a kind."""
+    analysis = make_analysis(2)
+    assert analysis.fit is not None
+    sweep = replace(next(r for r in analysis.records if r.kind == "step"), id="sweep", kind="sweep")
+    records = (*analysis.records, sweep)
+    runs = tuple(record.id for record in records if record.kind == kind)
+    fit = replace(analysis.fit, method=method, experiments=runs)
+    return replace(analysis, records=records, fit=fit)
+
+
+@pytest.mark.parametrize("method", ["time_fit", "bode_fit"])
+def test_only_a_fit_to_recordings_is_drawn_over_them(method):
+    """Steps and sweeps have the model's line only if the model was fitted to these recordings."""
+    is_fitted = method == "time_fit"
+    steps = pictures(step_blocks(Page(fitted_to("step", method=method))))["steps"]
+    assert ("Lines: the model" in plain(steps.caption)) == is_fitted
+    sweeps = pictures(sweep_blocks(Page(fitted_to("sweep", method=method))))
+    assert [*sweeps] == (["sweep"] if is_fitted else [])
+
+
+def test_a_fitted_step_without_a_gain_is_drawn():
+    """A step that is too short for a static gain is drawn if the model was fitted to it."""
+    analysis = replace(fitted_to("step", method="time_fit"), step_gains=())
+    assert [*pictures(step_blocks(Page(analysis)))] == ["steps"]
+
+
+# ------------------------------------------------------------ many closed loops
+
+
+def looped(*shares: float) -> Analysis:
+    """Return an analysis of two carts with a closed-loop run for each difference."""
+    analysis = make_analysis(2)
+    checks = [
+        replace(check, experiment=f"loop-{i}", nrmse=share * (1.0 if check.cart == 1 else 0.5))
+        for i, share in enumerate(shares)
+        for check in analysis.hardware
+    ]
+    return replace(analysis, hardware=tuple(checks))
+
+
+@pytest.mark.parametrize("shares", [(0.3,), (0.3, 0.1), (0.2, 0.1, 0.4, 0.3, 0.15, 0.25, 0.2)])
+def test_closed_loops_have_one_figure_and_a_row_for_each_run(shares):
+    """However many runs there are, one figure shows the worst and the best; the table has all."""
+    analysis = looped(*shares)
+    table, *others = hardware_blocks(Page(analysis))
+    (picture,) = pictures(others).values()
+    assert isinstance(table, Table)
+    runs = [plain(row[0].text) for row in table.rows]
+    simulations = {(check.experiment, check.loop) for check in analysis.hardware}
+    many = len(shares) > 2
+    assert len(runs) == len(simulations) * (1 if many else 2)
+    assert {*runs} == {check.experiment for check in analysis.hardware}
+    assert f"loop-{int(np.argmax(shares))}" in plain(picture.caption)
+    if len(shares) > 1:
+        assert f"loop-{int(np.argmin(shares))}" in plain(picture.caption)
+        assert f"loop-{int(np.argmin(shares))}" in picture.svg
+
+
+def test_a_model_looks_the_same_in_both_runs():
+    """In a figure of two runs, the model on the measured input has one style, also if alone."""
+    loop = make_analysis(1).hardware[0]
+    check = replace(loop, loop="open", model=loop.model + 0.1)
+    runs = [HardwareRun(name="a", checks=[check]), HardwareRun(name="b", checks=[loop, check])]
+    with drawing():
+        figure = hardware_figure(runs, units=PAPER_UNITS)
+    left, right = (line_named(ax, "model on measured input") for ax in figure.axes[:2])
+    assert (left.get_color(), left.get_linestyle()) == (right.get_color(), right.get_linestyle())
+    legend = figure.axes[0].get_legend()
+    assert legend is not None
+    assert {"loop model", "model on measured input"} <= {t.get_text() for t in legend.get_texts()}
+
+
+@pytest.mark.parametrize(("scale", "used"), [(1.01, False), (1.3, False), (-3.5, True)])
+def test_the_table_says_whether_an_input_factor_was_used(scale, used):
+    """A factor on the logged input has a column, which says whether the simulation used it."""
+    analysis = make_analysis(1)
+    checks = [replace(c, input_scale=scale, scale_used=used) for c in analysis.hardware]
+    table, _ = hardware_blocks(Page(replace(analysis, hardware=tuple(checks))))
+    assert isinstance(table, Table)
+    shown = [plain(row[7].text) for row in table.rows if len(row) > 7]
+    assert shown == ([] if scale == 1.01 else [significant(scale, digits=3) + ", used" * used])

@@ -71,6 +71,7 @@ def springs_of(chain: Chain) -> tuple[bool, ...]:
     return tuple(bool(k > 0) for k in chain.k)
 
 
+LOOSE = Chain(m=np.array([2e-4, 2e-4]), c=np.array([5e-4, 5e-4]), k=np.array([0.0, 0.1, 0.0]))
 CHAINS = [*PRESETS.values(), FOUR]
 
 
@@ -143,16 +144,33 @@ def test_a_missing_spring_is_not_in_the_equations():
 
 
 def test_a_chain_without_walls_is_shown_as_polynomials():
-    """If a chain has no walls, its transfer function is printed as a ratio of polynomials.
+    """If a chain has no walls, its transfer functions are polynomials over one denominator.
 
     Without a static gain, the factors of the paper's form do not exist.
     """
     rigid = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
     text = to_text(numeric_transfer_functions(rigid).math)
-    assert text == "(X_1(s))/(U(s)) = (5000)/(s^2 + 2.500s)"
+    assert text == "(X_1(s))/(U(s)) = (5000)/(D(s)); D(s) = s^2 + 2.500s"
     assert symbolic_transfer_functions((False, False)) is None
-    loose = Chain(m=np.array([2e-4, 2e-4]), c=np.array([5e-4, 5e-4]), k=np.array([0.0, 0.1, 0.0]))
-    assert "s^4" in to_text(numeric_transfer_functions(loose).math)
+    assert to_text(numeric_transfer_functions(LOOSE).math).count("s^4") == 1
+
+
+@pytest.mark.parametrize("chain", [*CHAINS, LOOSE], ids=lambda chain: f"{chain.n}-carts")
+def test_copied_polynomials_are_those_of_the_chain(chain):
+    """The copy of the transfer functions has each polynomial once, with all its digits."""
+    lines = numeric_transfer_functions(chain).copy.splitlines()
+    copied = {
+        name: np.array(values.strip("[];").split(), dtype=float)
+        for name, values in (line.split(" = ") for line in lines)
+        if values.startswith("[")
+    }
+    assert [*copied] == ["D", *(f"N{i}" for i in range(1, chain.n + 1))]
+    s = 11.0j
+    got = [
+        np.polyval(copied[f"N{i}"], s) / np.polyval(copied["D"], s) for i in range(1, chain.n + 1)
+    ]
+    # Each number has ten digits; at this frequency, the terms nearly cancel by at most 100.
+    assert_allclose(got, chain.frequency_response(np.array([11.0]))[:, 0], rtol=1e-7)
 
 
 @pytest.mark.parametrize("chain", CHAINS, ids=lambda chain: f"{chain.n}-carts")

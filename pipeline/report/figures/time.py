@@ -1,24 +1,34 @@
 """Figures of recordings over time: decays, steps, dwells (paper: 12-14), closed loops (15-17)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import cycle
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from pipeline.arrays import Array
-from pipeline.report.figures import CARTS, MEASURED, MODEL, QUIET, SECOND_LINE, SHADE, THIRD
+from pipeline.report.figures import (
+    CARTS,
+    MEASURED,
+    MODEL,
+    QUIET,
+    SECOND_LINE,
+    SHADE,
+    THIRD,
+    Look,
+)
 from pipeline.report.figures.style import (
     keep_in_sight,
     legend_above,
+    name_panels,
     panels,
     plot_line,
     plot_measured,
     plot_model,
     plot_points,
-    plot_residuals,
-    plot_second,
     position_label,
     small_multiples,
 )
@@ -36,6 +46,9 @@ from pipeline.words.numbers import subscript
 _CYCLES_SHOWN = 10  # cycles shown of the steady part; few enough to tell them apart
 _LOOPS = {"closed": "loop model", "open": "model on measured input"}
 _SMALL = 1.15  # height in inches of each of many small panels
+_POINTS = 120  # measured points of a cart in a small panel; more would hide the model's line
+_MODELS: tuple[Look, ...] = ({"color": MODEL, "lw": 1.0}, SECOND_LINE)
+_SET_POINT: Look = {"color": THIRD, "lw": 0.9, "ls": "-."}
 
 
 # --------------------------------------------------------------------- decays
@@ -96,46 +109,124 @@ def plot_damping(ax: Axes, decay: LogDecrement, *, marker: str) -> None:
             color=QUIET)  # fmt: skip
 
 
-# ---------------------------------------------------------------------- steps
+# ------------------------------------------------------------ steps and sweeps
+
+Motion = Mapping[int, Array]  # by cart: the model's positions (n,) in a recording
 
 
 def step_figure(
-    steps: Sequence[Sequence[StepGain]], *, records: Sequence[Record], position_unit: str
+    steps: Sequence[Sequence[StepGain]],
+    *,
+    records: Sequence[Record],
+    position_unit: str,
+    models: Mapping[str, Motion] | None = None,
 ) -> Figure:
     """Return step recordings in small panels.
 
     Each entry of `steps` has the gains of all carts in one recording.
+
+    Parameters
+    ----------
+    models : by recording, the motion of the model that was fitted to it.
     """
+    motions = [(models or {}).get(record.id, {}) for record in records]
+    carts = [
+        sorted({gain.cart for gain in gains} | set(motion))
+        for gains, motion in zip(steps, motions, strict=True)
+    ]
     swings = [
-        max(float(np.ptp(record.position(gain.cart))) for gain in gains)
-        for gains, record in zip(steps, records, strict=True)
+        max(float(np.ptp(record.position(cart))) for cart in shown)
+        for shown, record in zip(carts, records, strict=True)
     ]
     figure, axes = small_multiples(
         [record.id for record in records], height=_SMALL, share_y=_alike(swings)
     )
-    for ax, gains, record in zip(axes, steps, records, strict=True):
-        plot_step(ax, gains, record=record)
+    for ax, gains, record, motion in zip(axes, steps, records, motions, strict=True):
+        plot_step(ax, gains, record=record, model=motion)
     label_outer(axes, x="time [s]", y=f"position [{position_unit}]")
     legend_above(axes[0], columns=5)
     return figure
 
 
-def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
+def plot_step(
+    ax: Axes, gains: Sequence[StepGain], *, record: Record, model: Motion | None = None
+) -> None:
     """Plot the positions of all carts in a step recording, and the levels between which they move.
 
-    A dashed line shows each level over the window in which it was measured.
+    The model's lines lie over the measured points. A dashed line shows each level over the window
+    in which it was measured.
     """
     for gain in gains:
-        _plot_cart_points(ax, record.t, record.position(gain.cart), cart=gain.cart)
         for edge in gain.edges:
             for window, level in (
                 (edge.window_before, edge.level_before),
                 (edge.window_after, edge.level_after),
             ):
                 ax.plot(window, (level, level), color=MEASURED, ls="--", lw=0.8, zorder=1.5)
-    ax.plot([], [], color=MEASURED, ls="--", lw=0.8, label="level")
+    if model:
+        plot_fitted(ax, record, model)
+    else:
+        for gain in gains:
+            _plot_cart_points(ax, record.t, record.position(gain.cart), cart=gain.cart)
+    if gains:
+        ax.plot([], [], color=MEASURED, ls="--", lw=0.8, label="level")
     for t in sorted({edge.t for gain in gains for edge in gain.edges}):
         ax.axvline(t, color=QUIET, lw=0.8, ls=":")
+
+
+def plot_fitted(ax: Axes, record: Record, model: Motion) -> None:
+    """Plot the measured points of carts, and over them the lines of the model fitted to them."""
+    for cart in sorted(model):
+        y = record.position(cart)
+        shown = _along(record.t, y, most=_POINTS)
+        plot_points(ax, record.t[shown], y[shown])
+        _plot_cart(ax, record.t, model[cart], cart=cart)
+    ax.plot([], [], ".", color=MEASURED, ms=3 * 2.2, mew=0, label="measured")
+
+
+def _along(t: Array, y: Array, *, most: int) -> NDArray[np.intp]:
+    """Return at most `most` samples, evenly spread along the drawn curve; few are at rest."""
+    size = np.array([np.ptp(t), np.ptp(y)])
+    steps = np.diff(np.array([t, y])) / np.where(size > 0, size, 1.0)[:, None]
+    path = np.append(0.0, np.cumsum(np.hypot(*steps)))
+    return np.unique(np.searchsorted(path, np.linspace(0.0, path[-1], most)))
+
+
+def sweep_figure(record: Record, *, model: Motion, position_unit: str) -> Figure:
+    """Return a sweep with the model that was fitted to it, and a row of panels for each cart.
+
+    On the left is the whole sweep, with what the model leaves of the motion. On the right are the
+    cycles around the largest swing, with the measured points and the model's line.
+    """
+    carts = sorted(model)
+    figure, axes = panels(*[0.95] * len(carts), columns=2, share_x="column")
+    cut = _largest_swing(record, model)
+    for whole, near, cart in zip(axes[::2], axes[1::2], carts, strict=True):
+        y, t = record.position(cart), record.t
+        plot_line(whole, t, y - np.median(y), {"color": QUIET, "lw": 0.7}, label="motion")
+        plot_line(whole, t, y - model[cart], {"color": MODEL, "lw": 0.8}, label="residual")
+        whole.axvspan(float(t[cut][0]), float(t[cut][-1]), color=SHADE, lw=0)
+        plot_measured(near, t[cut], y[cut])
+        plot_model(near, t[cut], model[cart][cut])
+        whole.set_ylabel(position_label(cart, position_unit))
+    for ax in axes[:2]:
+        legend_above(ax)
+    for ax in axes[-2:]:
+        ax.set_xlabel("time [s]")
+    return figure
+
+
+def _largest_swing(record: Record, model: Motion) -> slice:
+    """Return the samples of about ten cycles of cart motion, around the largest swing."""
+    centred = np.array([y - np.median(y) for y in model.values()])
+    size = np.abs(centred) / np.maximum(np.ptp(centred, axis=1, keepdims=True), 1e-300)
+    cart, middle = np.unravel_index(int(size.argmax()), size.shape)
+    crossings = np.flatnonzero(np.diff(np.signbit(centred[cart])))
+    at = int(np.searchsorted(crossings, middle))
+    before, after = crossings[:at][-_CYCLES_SHOWN:], crossings[at:][:_CYCLES_SHOWN]
+    first = int(before[0]) if before.size == _CYCLES_SHOWN else 0
+    last = int(after[-1]) if after.size == _CYCLES_SHOWN else record.t.size - 1
+    return slice(first, last + 1)
 
 
 def _plot_cart_points(ax: Axes, t: Array, y: Array, *, cart: int) -> None:
@@ -195,36 +286,92 @@ def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
 # ------------------------------------------------------------------- feedback
 
 
-def hardware_figure(
-    checks: Sequence[Sequence[HardwareCheck]],
-    *,
-    record: Record | None,
-    units: Units,
-) -> Figure:
-    """Return a figure of one run: each cart with its set point, the residuals, and the input.
+@dataclass(frozen=True, kw_only=True)
+class HardwareRun:
+    """One run of model against measurement.
+
+    Attributes
+    ----------
+    checks : comparison with one or two models, for each cart.
+    record : the recording with the input; None leaves the input out.
+    """
+
+    name: str
+    checks: Sequence[HardwareCheck]
+    record: Record | None = None
+
+    @property
+    def has_input(self) -> bool:
+        """Whether the input was logged."""
+        return self.record is not None and self.record.u is not None
+
+    @property
+    def worst(self) -> HardwareCheck:
+        """The comparison with the largest difference."""
+        return max(self.checks, key=lambda check: check.nrmse)
+
+
+def hardware_figure(runs: Sequence[HardwareRun], *, units: Units) -> Figure:
+    """Return runs side by side: each cart with its set point, the residuals, and the input."""
+    carts = sorted({check.cart for run in runs for check in run.checks})
+    loops = sorted({check.loop for run in runs for check in run.checks})
+    driven = any(run.has_input for run in runs)
+    heights = [*[0.9, 0.62] * len(carts), *([0.6] if driven else [])]
+    several = len(runs) > 1
+    figure, axes = panels(*heights, columns=len(runs), share_x="column", titled=several)
+    for column, run in enumerate(runs):
+        own = axes[column :: len(runs)]
+        for above, below, cart in zip(own[::2], own[1::2], carts, strict=False):
+            checks = [check for check in run.checks if check.cart == cart]
+            if checks:
+                plot_hardware(above, checks, loops=loops)
+                _plot_hardware_residuals(below, checks, loops=loops)
+            if not column:
+                above.set_ylabel(position_label(cart, units.position))
+                below.set_ylabel(f"residual [{units.position}]")
+        if run.has_input:
+            assert run.record is not None
+            plot_effort(own[-1], run.record, model=run.checks[0].effort)
+        own[-1].set_xlabel("time [s]")
+    if driven:
+        axes[-len(runs)].set_ylabel(f"u [{units.input}]")
+    if several:
+        name_panels(axes[: len(runs)], [run.name for run in runs], columns=len(runs))
+    every = {check.loop for check in runs[0].checks}
+    for k, loop in enumerate(loops):
+        if loop not in every:
+            axes[0].plot([], [], label=_LOOPS[loop], **_MODELS[k])
+    if any(check.set_point is not None for run in runs for check in run.checks):
+        axes[0].plot([], [], label="set point", **_SET_POINT)
+    legend_above(axes[0])
+    return figure
+
+
+def plot_hardware(ax: Axes, checks: Sequence[HardwareCheck], *, loops: Sequence[str]) -> None:
+    """Plot a cart's set point and motion, and one or two models with which it is compared.
 
     Parameters
     ----------
-    checks : comparison of the measurement with one or two models, for each cart.
-    record : the recording with the input; None leaves the input out.
+    loops : all models of the figure, so that a model looks the same in each panel.
     """
-    driven = record if record is not None and record.u is not None else None
-    figure, axes = panels(*[0.9, 0.62] * len(checks), *([0.6] if driven else []))
-    for above, below, group in zip(axes[::2], axes[1::2], checks, strict=False):
-        if (set_point := group[0].set_point) is not None:
-            above.step(group[0].t, set_point, where="post", color=THIRD, lw=0.9, ls="-.")
-            axes[0].plot([], [], color=THIRD, lw=0.9, ls="-.", label="set point")
-        plot_hardware(above, group)
-        above.set_ylabel(position_label(group[0].cart, units.position))
-        plot_residuals(below, group[0].t, *(check.measured - check.model for check in group))
-        keep_in_sight(below, group[0].measured - np.median(group[0].measured))
-        below.set_ylabel(f"residual [{units.position}]")
-    if driven:
-        plot_effort(axes[-1], driven, model=checks[0][0].effort)
-        axes[-1].set_ylabel(f"u [{units.input}]")
-    legend_above(axes[0])
-    axes[-1].set_xlabel("time [s]")
-    return figure
+    first = checks[0]
+    if first.set_point is not None:
+        ax.step(first.t, first.set_point, where="post", **_SET_POINT)
+    plot_measured(ax, first.t, first.measured)
+    for check in checks:
+        look = _MODELS[loops.index(check.loop)]
+        plot_line(ax, check.t, check.model, look, label=_LOOPS[check.loop])
+    keep_in_sight(ax, first.measured)
+
+
+def _plot_hardware_residuals(
+    ax: Axes, checks: Sequence[HardwareCheck], *, loops: Sequence[str]
+) -> None:
+    ax.axhline(0.0, color=QUIET, lw=0.6)
+    for check in checks:
+        look = _MODELS[loops.index(check.loop)] | {"lw": 0.8}
+        plot_line(ax, check.t, check.measured - check.model, look)
+    keep_in_sight(ax, checks[0].measured - np.median(checks[0].measured))
 
 
 def plot_effort(ax: Axes, record: Record, *, model: Array | None) -> None:
@@ -234,14 +381,6 @@ def plot_effort(ax: Axes, record: Record, *, model: Array | None) -> None:
     if model is not None:
         plot_line(ax, record.t, model, {"color": MODEL, "lw": 1.0})
         keep_in_sight(ax, record.u)
-
-
-def plot_hardware(ax: Axes, checks: Sequence[HardwareCheck]) -> None:
-    """Plot the measurement, and one or two models with which it is compared."""
-    plot_measured(ax, checks[0].t, checks[0].measured)
-    for check, plot in zip(checks, (plot_model, plot_second), strict=False):
-        plot(ax, check.t, check.model, label=_LOOPS[check.loop])
-    keep_in_sight(ax, checks[0].measured)
 
 
 def design_figure(design: FeedbackDesign, *, units: Units) -> Figure:

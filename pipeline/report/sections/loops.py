@@ -1,14 +1,15 @@
 """Sections on control: the designed feedback, and the comparison of model and measurement."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
-from pipeline.report.builder import Page, remarks
+from pipeline.report.builder import Page
 from pipeline.report.document import Block, Code, Table, paragraph
 from pipeline.report.equations.model import controller_equations, matlab_code, weights_formula
-from pipeline.report.figures.time import design_figure, hardware_figure
+from pipeline.report.figures.time import HardwareRun, design_figure, hardware_figure
 from pipeline.results import FeedbackDesign, HardwareCheck, Margins
 from pipeline.words.numbers import NOTHING, complex_text, count, percent, significant, unit_text
 from pipeline.words.phrases import phrases
@@ -18,6 +19,8 @@ _WORDS = phrases("measurements")
 # Share of the motion (rms). A good linear model has a smaller error; a larger one raises a
 # question.
 CLOSE = 0.10
+_MANY_RUNS = 2  # With more runs than this, the table has a row for each run, not for each cart.
+_SCALED = 0.05  # A factor on the logged input that differs from 1 by less is not worth mentioning.
 
 
 def feedback_blocks(page: Page) -> list[Block]:
@@ -123,39 +126,48 @@ def _ascending(poles: ComplexArray) -> ComplexArray:
 
 
 def hardware_blocks(page: Page) -> list[Block]:
-    """Return the comparison of model and measurement, for every run and cart."""
+    """Return the comparison of model and measurement: a table of all runs, and one figure.
+
+    The figure shows at most two runs: the one with the largest and the one with the smallest
+    difference.
+    """
     checks = page.analysis.hardware
     if not checks:
         return []
-    blocks: list[Block] = [_hardware_table(page)]
-    for i, run in enumerate(dict.fromkeys(check.experiment for check in checks), start=1):
-        of_run = [check for check in checks if check.experiment == run]
-        carts = sorted({check.cart for check in of_run})
-        by_cart = [[check for check in of_run if check.cart == cart] for cart in carts]
-        figure = hardware_figure(by_cart, record=page.records.get(run), units=page.units)
-        worst = max(of_run, key=lambda check: check.nrmse)
-        said = {
-            "run": run,
-            "cart": worst.cart,
-            "carts": count(len(carts), "cart"),
-            "left": percent(100 * worst.nrmse),
-        }
-        blocks.append(page.picture(f"hardware-{i}", figure, _WORDS, "hardware", **said))
-    scaled = {check.experiment for check in checks if check.is_scaled}
-    scales = [
-        _WORDS.text(
-            "input_scaled" if c.experiment in scaled else "input_scale",
-            run=c.experiment,
-            scale=significant(c.input_scale, digits=3),
+    runs = [
+        HardwareRun(
+            name=clean(run),
+            checks=[check for check in checks if check.experiment == run],
+            record=page.records.get(run),
         )
-        for c in checks
-        # A difference below 5 % is not worth mentioning.
-        if c.input_scale is not None and abs(c.input_scale - 1) > 0.05
+        for run in dict.fromkeys(check.experiment for check in checks)
     ]
-    return [*blocks, *remarks(list(dict.fromkeys(scales)))]
+    worst, *others = sorted(runs, key=lambda run: -run.worst.nrmse)
+    drawn = [worst, *others[-1:]]
+    said = {
+        "run": worst.name,
+        "cart": worst.worst.cart,
+        "carts": count(len({check.cart for check in worst.checks}), "cart"),
+        "left": percent(100 * worst.worst.nrmse),
+        "others": _WORDS.text("hardware_best", runs=len(runs), run=drawn[-1].name)
+        if others
+        else "",
+    }
+    figure = hardware_figure(drawn, units=page.units)
+    return [
+        _hardware_table(page, runs),
+        page.picture("hardware", figure, _WORDS, "hardware", **said),
+    ]
 
 
-def _hardware_table(page: Page) -> Table:
+def _hardware_table(page: Page, runs: Sequence[HardwareRun]) -> Table:
+    """Return the numbers of every run: a row for each cart, or for many runs, one for each run."""
+    many = len(runs) > _MANY_RUNS
+    shown = [
+        [check for check in run.checks if check.loop == loop]
+        for run in runs
+        for loop in dict.fromkeys(check.loop for check in run.checks)
+    ]
     rows = [
         (
             clean(check.experiment),
@@ -165,10 +177,34 @@ def _hardware_table(page: Page) -> Table:
             _overshoots(check),
             _pair(check.settling_model, check.settling_measured),
             _pair(check.steady_state_model, check.steady_state_measured),
+            _input_factor(check),
         )
-        for check in page.analysis.hardware
+        for checks in shown
+        for check in ([_telling(checks)] if many else checks)
     ]
-    return page.table(_WORDS, "hardware_table", rows, "lcldrrr", position=page.position)
+    # The factor is shown where a difference from 1 is worth mentioning.
+    scales = [check.input_scale for run in runs for check in run.checks]
+    scaled = any(scale is not None and abs(scale - 1) > _SCALED for scale in scales)
+    columns = None if scaled else 7
+    said = {
+        "position": page.position,
+        "many": _WORDS.text("hardware_table_many") if many else "",
+        "factor": _WORDS.text("hardware_table_factor") if scaled else "",
+    }
+    shown_rows = [row[:columns] for row in rows]
+    return page.table(_WORDS, "hardware_table", shown_rows, "lcldrrrd"[:columns], **said)
+
+
+def _telling(checks: Sequence[HardwareCheck]) -> HardwareCheck:
+    """Return the check of the controlled cart or, if it is unknown, the largest difference."""
+    return max(checks, key=lambda check: (check.set_point is not None, check.nrmse))
+
+
+def _input_factor(check: HardwareCheck) -> str:
+    if check.input_scale is None:
+        return NOTHING
+    used = ", used" if check.is_scaled else ""
+    return f"{significant(check.input_scale, digits=3)}{used}"
 
 
 def _overshoots(check: HardwareCheck) -> str:

@@ -1,16 +1,33 @@
 """Sections on the measurements: frequency response, decays, steps, sine dwells."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
+from pipeline.estimation.record_fit import record_fits
 from pipeline.identify.model_checks import name_law
 from pipeline.names import mode_suffixes, omega_names
 from pipeline.report.builder import Page, left_out
 from pipeline.report.document import Block, Details, Table, cell, paragraph
 from pipeline.report.figures import CARTS
 from pipeline.report.figures.bode import bode_figure, overview_figure
-from pipeline.report.figures.time import damping_figure, decay_figure, sine_figure, step_figure
-from pipeline.results import FrequencyResponse
-from pipeline.words.numbers import count, listing, percent, significant, with_error
+from pipeline.report.figures.time import (
+    Motion,
+    damping_figure,
+    decay_figure,
+    sine_figure,
+    step_figure,
+    sweep_figure,
+)
+from pipeline.results import ExperimentKind, FrequencyResponse
+from pipeline.words.numbers import (
+    count,
+    join_names,
+    listing,
+    percent,
+    significant,
+    with_error,
+)
 from pipeline.words.phrases import phrases
 from pipeline.words.text import clean, spans
 
@@ -117,14 +134,15 @@ def decay_blocks(page: Page) -> list[Block]:
         if not drawn:
             continue
         records, first = [page.records[decay.experiment] for decay in drawn], drawn[0]
-        others = [d for d in drawn if not d.law.is_exponential]
-        laws = [f"{clean(d.name)} ({name_law(d, unit=page.position)})" for d in others]
+        others = sum(not d.law.is_exponential for d in drawn)
         said = {
             "cart": cart,
             "zeta": with_error(first.zeta, first.zeta_std),
             "run": clean(first.name),
             "freed": _WORDS.text("let_go" if records[0].kind == "decay" else "stepped"),
-            "others": _WORDS.text("decay_others", others=listing(laws)) if laws else "",
+            "others": _WORDS.text("decay_others", others=others, decays=len(drawn))
+            if others
+            else "",
             "more": left_out(len(of_cart) - len(drawn)),
             "records": count(len(drawn), "record"),
             "swing": significant(float(np.ptp(first.peak_y)), digits=2),
@@ -136,7 +154,7 @@ def decay_blocks(page: Page) -> list[Block]:
     changing = [d for d in decays if not d.law.is_exponential]
     if changing := [d for d in changing if d.zeta_at_amplitude.shape[1] > 1]:
         figure = damping_figure(changing, position_unit=page.position)
-        runs = listing(list(dict.fromkeys(clean(d.name) for d in changing)))
+        runs = join_names(list(dict.fromkeys(clean(d.name) for d in changing)))
         blocks.append(page.picture("damping", figure, _WORDS, "damping", runs=runs))
     return blocks
 
@@ -159,26 +177,89 @@ def _decay_table(page: Page) -> Table:
 
 
 def step_blocks(page: Page) -> list[Block]:
-    """Return the static gains, and the step responses from which they were read."""
+    """Return the static gains, and the steps with the model's lines if it was fitted to them."""
     gains = page.analysis.step_gains
-    if not gains:
-        return []
-    blocks: list[Block] = [_step_table(page)]
-    runs = list(dict.fromkeys(g.experiment for g in gains if g.experiment in page.records))
+    blocks: list[Block] = [_step_table(page)] if gains else []
+    fitted = _fitted_runs(page, "step")
+    with_gains = [g.experiment for g in gains if g.experiment in page.records]
+    runs = list(dict.fromkeys([*with_gains, *fitted]))
     if drawn := runs[:_MOST_PANELS]:
+        models = _fitted_motions(page, [run for run in drawn if run in fitted])
         figure = step_figure(
             [[g for g in gains if g.experiment == run] for run in drawn],
             records=[page.records[run] for run in drawn],
             position_unit=page.position,
+            models=models,
         )
         carts = zip(range(1, page.analysis.bench.n + 1), CARTS, strict=False)
+        styles = " ".join(f"{mark.capitalize()}: cart {cart}." for cart, (*_, mark) in carts)
         said = {
-            "styles": " ".join(f"{mark.capitalize()}: cart {cart}." for cart, (*_, mark) in carts),
+            "what": _WORDS.text("steps_fitted", left=_left(page, models)) if models else styles,
+            "levels": _WORDS.text("steps_levels") if with_gains else "",
             "more": left_out(len(runs) - len(drawn)),
             "records": count(len(drawn), "record"),
         }
         blocks.append(page.picture("steps", figure, _WORDS, "steps", **said))
     return blocks
+
+
+def sweep_blocks(page: Page) -> list[Block]:
+    """Return the sweep that the model fitted to it explains worst."""
+    runs = _fitted_runs(page, "sweep")
+    motions = _fitted_motions(page, runs)
+    if not motions:
+        return []
+    worst = max(motions, key=lambda run: max(_shares_left(page, run, motions[run])))
+    figure = sweep_figure(page.records[worst], model=motions[worst], position_unit=page.position)
+    said = {
+        "run": clean(worst),
+        "left": _left(page, {worst: motions[worst]}),
+        "worst": _WORDS.text("sweep_worst", sweeps=count(len(runs), "sweep"))
+        if len(runs) > 1
+        else "",
+        "carts": count(len(motions[worst]), "cart"),
+    }
+    return [page.picture("sweep", figure, _WORDS, "sweep", **said)]
+
+
+def _fitted_runs(page: Page, kind: ExperimentKind) -> list[str]:
+    """Return the recordings of a kind to which the model was fitted in the time domain."""
+    fit = page.analysis.fit
+    if page.analysis.chain is None or fit is None or fit.method != "time_fit":
+        return []
+    records = (page.records[run] for run in fit.experiments if run in page.records)
+    return [record.id for record in records if record.kind == kind]
+
+
+def _fitted_motions(page: Page, runs: Sequence[str]) -> dict[str, Motion]:
+    """Return the model's motion in recordings; start and encoder zeros are fitted to each."""
+    chain = page.analysis.chain
+    if chain is None:
+        return {}
+    records = [page.records[run] for run in runs]
+    return {
+        run: {
+            cart: page.records[run].position(cart) + residual
+            for cart, residual in fit.residual.items()
+        }
+        for run, fit in record_fits(records, chain).items()
+    }
+
+
+def _shares_left(page: Page, run: str, model: Motion) -> list[float]:
+    """Return what the model leaves of each cart's motion in a recording (rms, percent)."""
+    return [
+        100 * float(np.std(page.records[run].position(cart) - y))
+        / float(np.std(page.records[run].position(cart)))
+        for cart, y in model.items()
+    ]  # fmt: skip
+
+
+def _left(page: Page, models: Mapping[str, Motion]) -> str:
+    """Return the range of what the model leaves of the motion: "0.4 %", "1.2 to 3.5 %"."""
+    shares = [share for run, model in models.items() for share in _shares_left(page, run, model)]
+    low, high = (significant(share, digits=2) for share in (min(shares), max(shares)))
+    return f"{high} %" if low == high else f"{low} to {high} %"
 
 
 def _step_table(page: Page) -> Table:
