@@ -28,7 +28,7 @@ FIGURES = {
 DEMO_FIGURES = {
     "report/figures/overview.svg": "overview.svg",
     "report/figures/bode-cart-2.svg": "three-carts-bode.svg",
-    "report/figures/hardware-1.svg": "hardware.svg",
+    "report/figures/hardware.svg": "hardware.svg",
     "gap/figures/before-after-1.svg": "before-after.svg",
     "gap/figures/effect-1.svg": "effect.svg",
 }

@@ -119,7 +119,7 @@ LABS = {
         write=lambda folder: write_two_cart_submission(folder, REAL_DATA, steps=(1, 2, 3, 4, 5)),
         figures={
             "gap/figures/by-record.svg": "two-runs.svg",
-            "report/figures/hardware-1.svg": "two-loop.svg",
+            "report/figures/hardware.svg": "two-loop.svg",
         },
     ),
     "day": Lab(write=write_day, figures={"gap/figures/before-after-1.svg": "day-gap.svg"}),

@@ -346,7 +346,7 @@ def test_every_panel_of_a_bode_figure_has_ticks_at_all_digits():
     drawn(figure)
     for ax in figure.axes:
         (ticks,) = (artist for artist in ax.get_children() if isinstance(artist, DigitTicks))
-        assert len(ticks.get_path().vertices) > 16
+        assert len(np.asarray(ticks.get_path().vertices)) > 16
 
 
 def test_the_users_matplotlib_settings_do_not_matter():
@@ -570,7 +570,7 @@ def points_of(ax: Axes) -> list[np.ndarray]:
 
 def line_named(ax: Axes, name: str) -> Any:
     """Return the line with points that has a name in the legend."""
-    (line,) = (one for one in ax.lines if one.get_label() == name and len(one.get_xdata()))
+    (line,) = (one for one in ax.lines if one.get_label() == name and np.size(one.get_xdata()))
     return line
 
 

@@ -7,7 +7,6 @@ from itertools import cycle
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.report.figures import (
@@ -177,19 +176,9 @@ def plot_step(
 def plot_fitted(ax: Axes, record: Record, model: Motion) -> None:
     """Plot the measured points of carts, and over them the lines of the model fitted to them."""
     for cart in sorted(model):
-        y = record.position(cart)
-        shown = _along(record.t, y, most=_POINTS)
-        plot_points(ax, record.t[shown], y[shown])
+        plot_points(ax, record.t, record.position(cart), most=_POINTS)
         _plot_cart(ax, record.t, model[cart], cart=cart)
     ax.plot([], [], ".", color=MEASURED, ms=3 * 2.2, mew=0, label="measured")
-
-
-def _along(t: Array, y: Array, *, most: int) -> NDArray[np.intp]:
-    """Return at most `most` samples, evenly spread along the drawn curve; few are at rest."""
-    size = np.array([np.ptp(t), np.ptp(y)])
-    steps = np.diff(np.array([t, y])) / np.where(size > 0, size, 1.0)[:, None]
-    path = np.append(0.0, np.cumsum(np.hypot(*steps)))
-    return np.unique(np.searchsorted(path, np.linspace(0.0, path[-1], most)))
 
 
 def sweep_figure(record: Record, *, model: Motion, position_unit: str) -> Figure:
