@@ -704,7 +704,7 @@ def test_a_model_looks_the_same_in_both_runs():
 def test_the_table_says_whether_an_input_factor_was_used(scale, used):
     """A factor on the logged input has a column, which says whether the simulation used it."""
     analysis = make_analysis(1)
-    checks = [replace(c, input_scale=scale, scale_used=used) for c in analysis.hardware]
+    checks = [replace(c, input_scale=scale, is_scaled=used) for c in analysis.hardware]
     table, _ = hardware_blocks(Page(replace(analysis, hardware=tuple(checks))))
     assert isinstance(table, Table)
     shown = [plain(row[7].text) for row in table.rows if len(row) > 7]

@@ -163,6 +163,7 @@ def hardware_blocks(page: Page) -> list[Block]:
 def _hardware_table(page: Page, runs: Sequence[HardwareRun]) -> Table:
     """Return the numbers of every run: a row for each cart, or for many runs, one for each run."""
     many = len(runs) > _MANY_RUNS
+    scaled_runs = {check.experiment for check in page.analysis.hardware if check.is_scaled}
     shown = [
         [check for check in run.checks if check.loop == loop]
         for run in runs
@@ -177,7 +178,7 @@ def _hardware_table(page: Page, runs: Sequence[HardwareRun]) -> Table:
             _overshoots(check),
             _pair(check.settling_model, check.settling_measured),
             _pair(check.steady_state_model, check.steady_state_measured),
-            _input_factor(check),
+            _input_factor(check, used=check.experiment in scaled_runs),
         )
         for checks in shown
         for check in ([_telling(checks)] if many else checks)
@@ -200,11 +201,10 @@ def _telling(checks: Sequence[HardwareCheck]) -> HardwareCheck:
     return max(checks, key=lambda check: (check.set_point is not None, check.nrmse))
 
 
-def _input_factor(check: HardwareCheck) -> str:
+def _input_factor(check: HardwareCheck, *, used: bool) -> str:
     if check.input_scale is None:
         return NOTHING
-    used = ", used" if check.is_scaled else ""
-    return f"{significant(check.input_scale, digits=3)}{used}"
+    return f"{significant(check.input_scale, digits=3)}{', used' if used else ''}"
 
 
 def _overshoots(check: HardwareCheck) -> str:
