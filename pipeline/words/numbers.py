@@ -9,6 +9,7 @@ _SUBSCRIPT = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _PLAIN_RANGE = (1e-3, 1e5)  # numbers of this size are written without a power of ten
 _MOST_DIGITS = 5
 _FINEST = 1e-8  # a smaller relative error belongs to exact data and is not told
+_ONE_DIGIT = 1e-3  # a smaller relative error has one digit
 SMALL_ERROR = 1e-4  # a smaller relative error is only told to be so: no calibration is that good
 NOTHING = "–"
 _TIMES = " × 10"
@@ -46,14 +47,16 @@ def with_errors(column: Sequence[tuple[float, float | None]]) -> list[str]:
 def with_error(value: float, std: float | None, *, digits: int = 2, power: bool = False) -> str:
     """Return "value ± std", rounded to `digits` digits of the standard error.
 
-    An error below 0.01 % of the value is written "± < 0.01 %". A power of ten is used if the number
-    is very large or very small, or if `power` is true.
+    An error below 0.1 % of the value has one digit; one below 0.01 % is written "± < 0.01 %". A
+    power of ten is used if the number is very large or very small, or if `power` is true.
     """
     if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
         return significant(value, power=power)
     if std < SMALL_ERROR * abs(value):
         text = significant(value, digits=_MOST_DIGITS, power=power)
         return text if std < _FINEST * abs(value) else f"{text} ± {share(std / abs(value))}"
+    if std < _ONE_DIGIT * abs(value):
+        digits = 1
     size = _exponent(max(abs(value), std), digits=2)
     if _is_plain(size) and not power:
         decimals = digits - 1 - _exponent(std, digits=digits)
