@@ -20,20 +20,16 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA, resolution
+from pipeline.plant.chain import Chain
 from pipeline.results import Intervention, Record
 
 # ---------------------------------------------------------------------- modulating functions
 
 
-def bump(s: Array, *, span: Array | float) -> tuple[Array, Array, Array]:
+def bump(s: Array, *, span: Array) -> tuple[Array, Array, Array]:
     """Return (s (1 - s))⁴ for s from 0 to 1 over `span` seconds, and two time derivatives."""
     b, slope = s * (1 - s), 1 - 2 * s
     return b**4, 4 * b**3 * slope / span, (12 * b**2 * slope**2 - 8 * b**3) / span**2
-
-
-def bump_integral(s: Array) -> Array:
-    """Return the integral of the bump from 0 to s; these are the weights for a held input."""
-    return s**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], s)
 
 
 def is_even(t: Array) -> bool:
@@ -47,28 +43,77 @@ def motion_period(x: Array) -> float:
     return float(2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2)))
 
 
-def window_weights(t: Array) -> tuple[Array, Array, Array]:
-    """Return weights (windows, samples) for the mean, the negative mean slope, and the curvature.
+class Windows:
+    """Means over windows of a record, weighted by a bump.
 
     With few samples the bump's derivatives are integrated badly. So the weights are corrected to be
     exact for parabolas.
 
     Parameters
     ----------
-    t : times (windows, samples) of the samples in each window, s.
+    t : times (n,) of all samples, s.
+    first : the first sample of each window, as indices (windows,) or as a slice. With a slice, no
+        samples are copied.
+    width : number of samples in a window.
+
+    Attributes
+    ----------
+    weights : weights of the samples for the mean, the rate of change and the curvature, shape
+        (3, windows, samples), or (3, 1, samples) if all windows have the same.
+    held : weights (…, samples - 1) for an input that is held after each sample.
     """
-    span = t[:, -1:] - t[:, :1]
-    w, w1, w2 = bump((t - t[:, :1]) / span, span=span)
-    dt = np.gradient(t, axis=1)
-    size = (w * dt).sum(1, keepdims=True)
-    w, w1, w2 = (weight * dt / size for weight in (w, w1, w2))
-    tau = t - (w * t).sum(1, keepdims=True)
-    spread = (w * tau**2).sum(1, keepdims=True)
-    w2 = w2 - w * w2.sum(1, keepdims=True) - w * tau * (w2 * tau).sum(1, keepdims=True) / spread
-    w2 = 2 * w2 / (w2 * tau**2).sum(1, keepdims=True)
-    w1 = w1 - w * w1.sum(1, keepdims=True)
-    w1 = -w1 / (w1 * tau).sum(1, keepdims=True)
-    return w, w1, w2
+
+    def __init__(self, t: Array, *, first: NDArray[np.intp] | slice, width: int) -> None:
+        self.first, self.width = first, width
+        # With an even clock, all windows have the weights of the first one.
+        local = self.cut(t)[: 1 if is_even(t) else None]
+        span = local[:, -1:] - local[:, :1]
+        s = (local - local[:, :1]) / span
+        # The integral of the bump from 0 to s, over that from 0 to 1.
+        share = 630 * s**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], s)
+        self.held = np.diff(share, axis=1)
+        w, w1, w2 = bump(s, span=span)
+        dt = np.gradient(local, axis=1)
+        size = (w * dt).sum(1, keepdims=True)
+        w, w1, w2 = (weight * dt / size for weight in (w, w1, w2))
+        tau = local - (w * local).sum(1, keepdims=True)
+        spread = (w * tau**2).sum(1, keepdims=True)
+        w2 = w2 - w * w2.sum(1, keepdims=True) - w * tau * (w2 * tau).sum(1, keepdims=True) / spread
+        w2 = 2 * w2 / (w2 * tau**2).sum(1, keepdims=True)
+        w1 = w1 - w * w1.sum(1, keepdims=True)
+        w1 = w1 / (w1 * tau).sum(1, keepdims=True)
+        self.weights = np.array([w, w1, w2])
+
+    def cut(self, x: Array) -> Array:
+        """Return the samples (…, windows, samples) of signals (…, n)."""
+        return sliding_window_view(x, self.width, axis=-1)[..., self.first, :]
+
+    def means(self, x: Array) -> Array:
+        """Return mean, rate of change and curvature (3, …, windows) of signals (…, n)."""
+        local = self.cut(x)
+        return np.array([_weighed(weight, local) for weight in self.weights])
+
+    def held_mean(self, u: Array) -> Array:
+        """Return the means (…, windows) of inputs (…, n) that are held after each sample."""
+        return _weighed(self.held, self.cut(u)[..., :-1])
+
+    def gain(self, chain: Chain, cart: int) -> float:
+        """Return the standard deviation of a cart's force that white noise of size 1 causes."""
+        held = chain.k[cart - 1] + chain.k[cart]
+        w, w1, w2 = self.weights
+        own = chain.m[cart - 1] * w2 + chain.c[cart - 1] * w1 + held * w
+        return float(np.median(np.linalg.norm(own, axis=1)))
+
+
+def _weighed(weights: Array, x: Array) -> Array:
+    """Return weighted sums over windows (…, windows, samples), which may share their weights."""
+    return x @ weights[0] if len(weights) == 1 else (weights * x).sum(-1)
+
+
+def required_force(chain: Chain, means: Array) -> Array:
+    """Return the force (n, windows) that a motion requires, from its `means` (3, n, windows)."""
+    x, v, acceleration = means
+    return chain.m[:, None] * acceleration + chain.c[:, None] * v + chain.stiffness @ x
 
 
 # --------------------------------------------------------- the law of one cart, from all records
@@ -156,8 +201,7 @@ class WindowMeans:
         inputs = np.array([*(np.interp(t - lag, t, u) for lag in _LAGS), u != 0.0])
         # At most 1000 windows are computed at once, to limit the memory for long recordings.
         parts = np.array_split(first, -(-first.size // 1000))
-        means = np.hstack([_means(t, record.y, inputs, part[:, None] + np.arange(width))
-                           for part in parts])  # fmt: skip
+        means = np.hstack([_means(t, record.y, inputs, part, width) for part in parts])
         self.t, self.u, self.on = means[0], means[1:4], means[4]
         self.gain = float(np.median(means[5]))
         moved = means[6:].reshape(4, len(record.carts), -1)
@@ -246,35 +290,22 @@ def _hop(record: Record) -> int:
     return max(1, round(0.01 / record.sample_time))
 
 
-def _means(t: Array, y: Array, inputs: Array, at: NDArray[np.int64]) -> Array:
-    """Return means (6 + 4 carts, n) over the windows whose samples are `at` (n, samples).
+def _means(t: Array, y: Array, inputs: Array, first: NDArray[np.intp], width: int) -> Array:
+    """Return means (6 + 4 carts, n) over windows of `width` samples.
 
     The first rows are time, inputs, and the acceleration's gain for white noise. Four rows per cart
     follow: position, velocity, acceleration, and range of the readings.
     """
-    local = t[at]
-    # With an even clock, all windows have the weights of the first one.
-    clock = local[:1] if is_even(t) else local
-    w, w1, w2 = window_weights(clock)
-    s = (clock - clock[:, :1]) / (clock[:, -1:] - clock[:, :1])
-    held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
-    readings = [x[at] for x in y]
-    return np.array(
+    windows = Windows(t, first=first, width=width)
+    return np.vstack(
         [
-            _weighed(w, local),
-            *(_weighed(held, u[at[:, :-1]]) for u in inputs),
-            np.broadcast_to(np.linalg.norm(w2, axis=1), len(at)),
-            *(_weighed(w, x) for x in readings),
-            *(-_weighed(w1, x) for x in readings),
-            *(_weighed(w2, x) for x in readings),
-            *(np.ptp(x, axis=1) for x in readings),
+            windows.means(t)[0],
+            windows.held_mean(inputs),
+            np.broadcast_to(np.linalg.norm(windows.weights[2], axis=1), first.size),
+            *windows.means(y),
+            np.ptp(windows.cut(y), axis=-1),
         ]
     )
-
-
-def _weighed(weights: Array, x: Array) -> Array:
-    """Return the weighted sums (n,) over windows (n, samples), which may share their weights."""
-    return x @ weights[0] if len(weights) == 1 else (weights * x).sum(1)
 
 
 def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Array], float]:
@@ -656,16 +687,16 @@ def _products(
     places = np.arange(first, last, max(width // 6, (last - first) // 400, 1))
     if places.size < max(_FEWEST_PLACES, parts):
         return []
-    weight, slope, bend = bump((np.arange(width) + 0.5) / width, span=width)
+    windows = Windows(t, first=places, width=width)
 
     def at(cart: int, *, late: float = 0.0) -> Array:
         return np.interp(t + late, record.t, record.position(cart))
 
-    own = sliding_window_view(at(cart), width)[places]
-    right = [own @ bend, -(own @ slope), own @ weight, np.zeros(places.size)]
+    own, slope, bend = windows.means(at(cart))
+    right = [bend, slope, own, np.zeros(places.size)]
     if cart + 1 in record.free:
-        right[3] = sliding_window_view(at(cart + 1, late=after), width)[places] @ weight
-    before = np.correlate(at(cart - 1), weight)
+        right[3] = windows.means(at(cart + 1, late=after))[0]
+    before = np.correlate(at(cart - 1), windows.weights[0, 0])
     shifts = np.arange(-_MOST_LATE, _MOST_LATE + 1)
     left = before[places - shifts[:, None]]
     # Encoder zeros cancel, and each record has the same weight.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from pipeline.arrays import Array
-from pipeline.estimation.force_balance import bump_integral, window_weights
+from pipeline.estimation.force_balance import Windows, required_force
 from pipeline.estimation.noise import high_frequency_noise
 from pipeline.gap.limits import BIC_DROP
 from pipeline.gap.parameters import GapModel, Nuisance, fresh_nuisance, simulate_run
@@ -87,51 +87,46 @@ def residual_forces(gap: Gap, *, free: Mapping[str, Sequence[int]]) -> tuple[Res
 
 def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> ResidualForce | None:
     trace = carts[cart]
-    t = trace.t
-    around = [carts.get(cart - 1), trace, carts.get(cart + 1)]
-    zero = np.zeros(t.size)
-    measured = np.array([zero if c is None else c.measured - c.zero for c in around])
-    simulated = np.array([zero if c is None else c.final - c.zero for c in around])
-    u = trace.u if cart == 1 else zero
+    t, n = trace.t, model.chain.n
+    # Rows are the carts and, on either side, a wall.
+    measured, simulated = np.zeros((2, n + 2, t.size))
+    for number, one in carts.items():
+        measured[number], simulated[number] = one.measured - one.zero, one.final - one.zero
+    u = trace.u if cart == 1 else np.zeros(t.size)
     inputs = np.array([u, _shaped_input(u, model)])
     noise = high_frequency_noise(trace.measured - trace.final)
-    i, chain = cart - 1, model.chain
-    before, after = chain.k[i], chain.k[i + 1]
     best = None
     # Lengths of the windows in s; the middle half has most of the weight.
     for length in (0.05, 0.07, 0.1, 0.15, 0.2, 0.3):
-        if (windows := _cut(t, length=length)) is None:
+        width = round(length * (t.size - 1) / float(t[-1] - t[0])) + 1
+        if not 9 <= width <= t.size:
             continue
-        local = t[windows]
-        s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
-        w, w1, w2 = window_weights(local)
-        # An input is held after its sample, so its weight is the exact share of the bump function
-        # in that interval.
-        held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
-        pushes = [(held * push[windows[:, :-1]]).sum(1) for push in inputs]
-        own = chain.m[i] * w2 - chain.c[i] * w1 + (before + after) * w
-        means = []
-        for x in (measured, simulated):
-            springs = (w * (before * x[0] + after * x[2])[windows]).sum(1)
-            means.append((own * x[1][windows]).sum(1) - springs - pushes[1])
-        position = np.array([(w * x[windows]).sum(1) for x in measured])
-        velocity = np.array([-(w1 * x[windows]).sum(1) for x in measured])
+        last = t.size - width
+        windows = Windows(
+            t, first=np.linspace(0, last, min(last + 1, 400)).astype(int), width=width
+        )
+        logged, shaped = windows.held_mean(inputs)
+        seen, followed = windows.means(measured), windows.means(simulated)
+        force = [
+            required_force(model.chain, m[:, 1:-1])[cart - 1] - shaped for m in (seen, followed)
+        ]
+        (before, position, after), (v_before, velocity, v_after) = seen[:2, cart - 1 : cart + 2]
         best = ResidualForce(
             experiment=trace.experiment,
             cart=cart,
             held_out=trace.held_out,
-            t=(w * local).sum(1),
-            measured=means[0],
-            model=means[1],
-            u=pushes[0],
-            shaped_input=pushes[1],
-            velocity=velocity[1],
-            position=position[1],
-            neighbours=position[[0, 2]],
-            neighbours_velocity=velocity[[0, 2]],
+            t=windows.means(t)[0],
+            measured=force[0],
+            model=force[1],
+            u=logged,
+            shaped_input=shaped,
+            velocity=velocity,
+            position=position,
+            neighbours=np.array([before, after]),
+            neighbours_velocity=np.array([v_before, v_after]),
         )
         # The noise must be less than a fiftieth of the force's range.
-        if noise * float(np.sqrt(np.median((own**2).sum(1)))) <= 0.02 * np.ptp(best.measured):
+        if noise * windows.gain(model.chain, cart) <= 0.02 * np.ptp(best.measured):
             break
     return best
 
@@ -140,16 +135,6 @@ def _shaped_input(u: Array, model: AugmentedChain) -> Array:
     """Return the input after dead zone and saturation; delays and lags are ignored."""
     drive = model.tables().drive
     return np.array([shaped_input(drive, float(one)) for one in u])
-
-
-def _cut(t: Array, *, length: float) -> np.ndarray | None:
-    """Return the sample numbers (windows, samples) of overlapping windows; None for a short run."""
-    width = round(length * (t.size - 1) / float(t[-1] - t[0])) + 1
-    if width < 9 or width > t.size:
-        return None
-    count = min(t.size - width + 1, 400)
-    first = np.linspace(0, t.size - width, count).astype(int)
-    return first[:, None] + np.arange(width)
 
 
 # ----------------------------------------------------- the force by position, velocity and input
@@ -191,8 +176,8 @@ def _of_run(
     cut = replace(cut, zero=np.where(run.free, own.zero, 0.0))
     read = simulate_run(model, cut, replace(fresh_nuisance(cut), scatter=own.scatter))
     first = np.array([end - width for start, end in pairwise(cut.shots) if end - start >= width])
-    windows = first[:, None] + np.arange(width)
-    w, w1, w2 = window_weights(t := cut.t[windows])
+    windows = Windows(cut.t, first=first, width=width)
+    t, weight = windows.cut(cut.t), np.broadcast_to(windows.weights[0], (first.size, width))
     n, chain = run.zero.size, model.structure.chain(model.theta)
     x, simulated = cut.by_cart(cut.y, own.zero), cut.by_cart(read, own.zero)
     speed = np.gradient(simulated, cut.t, axis=1)
@@ -202,35 +187,32 @@ def _of_run(
         step = simulated[:, ahead] - simulated[:, here]
         speed[:, here] = step / (cut.t[ahead] - cut.t[here])
     off = x - simulated
+    forces, accelerations = required_force(chain, windows.means(off)), windows.means(x)[2]
     out = []
     for j, i in enumerate(run.rows):
         around = {i - 1, i + 1} & {k for k in range(n) if run.free[k]}
         if not run.free[i] or not around <= set(run.rows):
             continue
-        own_weight = chain.m[i] * w2 - chain.c[i] * w1 + (chain.k[i] + chain.k[i + 1]) * w
-        force = (own_weight * off[i][windows]).sum(1)
-        for k, spring in ((i - 1, i), (i + 1, i + 1)):
-            if 0 <= k < n:
-                force -= chain.k[spring] * (w * off[k][windows]).sum(1)
         # A cart whose motion is within four times the noise is at rest; friction could then balance
         # any force.
-        moves = np.ptp(x[i][windows], axis=1) > 4.0 * run.sigma[j]
+        moves = np.ptp(windows.cut(x[i]), axis=1) > 4.0 * run.sigma[j]
         if not moves.any():
             continue
-        drift, rate = _smooth(t, off[i][windows])
-        noise = float(np.median(np.std(off[i][windows] - drift, axis=1)))
+        error = windows.cut(off[i])
+        drift, rate = _smooth(t, error)
+        noise = float(np.median(np.std(error - drift, axis=1)))
         left = WindowedResidualForce(
             experiment=run.id,
             cart=i + 1,
-            weight=w[moves],
+            weight=weight[moves],
             t=t[moves],
-            x=(simulated[i][windows] + drift)[moves],
-            v=(speed[i][windows] + rate)[moves],
-            u=(run.input if i == 0 else 0.0 * run.t)[windows[moves]],
-            acceleration=(w2 * x[i][windows]).sum(1)[moves],
-            force=force[moves],
+            x=(windows.cut(simulated[i]) + drift)[moves],
+            v=(windows.cut(speed[i]) + rate)[moves],
+            u=windows.cut(run.input if i == 0 else 0.0 * run.t)[moves],
+            acceleration=accelerations[i][moves],
+            force=forces[i][moves],
         )
-        out.append((left, noise * float(np.sqrt(np.median((own_weight**2).sum(1))))))
+        out.append((left, noise * windows.gain(chain, i + 1)))
     return out
 
 

@@ -16,11 +16,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import nnls
 
 from pipeline.arrays import Array
-from pipeline.estimation.force_balance import bump, motion_period
+from pipeline.estimation.force_balance import Windows, motion_period
 from pipeline.results import Record
 from pipeline.submission import Submission
 from pipeline.words.numbers import join_names
@@ -233,17 +232,16 @@ def _weigh(record: Record) -> _Weighed | None:
     other = record.position(2) if known else np.full(t.size, x[0])
     grid = np.linspace(t[0], t[-1], t.size)
     u, x, other = (np.interp(grid, t, a - a.mean()) for a in (u, x, other))
-    dt = float(grid[1] - grid[0])
     period = motion_period(x)
     if not np.isfinite(period):
         return None
     width = int(np.clip(period, _NARROWEST, t.size // _BUMPS))
-    weight, slope, bend = bump((np.arange(width) + 0.5) / width, span=width * dt)
-    sides = [(x, bend), (x, -slope), (x, weight), (x - other, weight)]
     last = x.size - width  # start of the last bump
     places = np.arange(1, last, max(width // 6, last // 400, 1))
-    centred = [sliding_window_view(u, width)[places + shift] @ weight for shift in (-1, 0, 1)]
-    centred += [sliding_window_view(a, width)[places] @ weights for a, weights in sides]
+    windows = [Windows(grid, first=places + shift, width=width) for shift in (-1, 0, 1)]
+    position, velocity, acceleration = windows[1].means(x)
+    centred = [one.means(u)[0] for one in windows]
+    centred += [acceleration, velocity, position, windows[1].means(x - other)[0]]
     early, now, late, *terms = (a - a.mean() for a in centred)  # offsets of the encoders cancel
     drive = np.array([early, now, late]) / np.linalg.norm(now)
     motion = np.array(terms).T / np.linalg.norm(now)

@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.estimation.force_balance import motion_period, window_weights
+from pipeline.estimation.force_balance import Windows, motion_period
 from pipeline.ingest.channels import encoder_step, is_stepped, mirrors
 from pipeline.ingest.clock import SLOW, read_clock
 from pipeline.ingest.table import FileTable
@@ -221,8 +221,8 @@ def _is_alike(values: Array, i: int, j: int) -> bool:
     return bool(abs(np.corrcoef(values[i], values[j])[0, 1]) > _ALIKE)
 
 
-def _averages(values: Array, signals: Sequence[int]) -> tuple[Array, Array, Array] | None:
-    """Return mean, slope and curvature (signals, windows); None if the record is short."""
+def _averages(values: Array, signals: Sequence[int]) -> Array | None:
+    """Return mean, slope and curvature (3, signals, windows); None if the record is short."""
     n = values.shape[1]
     if not signals:
         return None
@@ -232,12 +232,9 @@ def _averages(values: Array, signals: Sequence[int]) -> tuple[Array, Array, Arra
         width = max(n // 8, _FEWEST)
     if n < 4 * width:
         return None
-    weights = [w[0] for w in window_weights(np.arange(width, dtype=np.float64)[None, :])]
     hop = max(1, (n - width) // _MOST_WINDOWS)
-    mean, back, curvature = (
-        np.array([np.correlate(values[i], w, "valid")[::hop] for i in signals]) for w in weights
-    )
-    return mean, -back, curvature
+    windows = Windows(np.arange(float(n)), first=slice(None, None, hop), width=width)
+    return windows.means(values[list(signals)])
 
 
 def _left_unexplained(values: Array, signals: Sequence[int]) -> dict[int | None, float]:
