@@ -10,7 +10,7 @@ References: M. Shinbrot, Trans. ASME 79 (1957), 579-588; H. A. Preisig & D. W. T
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import TypeVar
 
@@ -26,10 +26,15 @@ from pipeline.results import Intervention, Record
 # ---------------------------------------------------------------------- modulating functions
 
 
-def bump(s: Array, *, span: Array) -> tuple[Array, Array, Array]:
+def bump(s: Array, *, span: Array | float) -> tuple[Array, Array, Array]:
     """Return (s (1 - s))⁴ for s from 0 to 1 over `span` seconds, and two time derivatives."""
     b, slope = s * (1 - s), 1 - 2 * s
     return b**4, 4 * b**3 * slope / span, (12 * b**2 * slope**2 - 8 * b**3) / span**2
+
+
+def bump_integral(s: Array) -> Array:
+    """Return the integral of the bump from 0 to s; these are the weights for a held input."""
+    return s**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], s)
 
 
 def is_even(t: Array) -> bool:
@@ -55,38 +60,45 @@ class Windows:
     first : the first sample of each window, as indices (windows,) or as a slice. With a slice, no
         samples are copied.
     width : number of samples in a window.
-
-    Attributes
-    ----------
-    weights : weights of the samples for the mean, the rate of change and the curvature, shape
-        (3, windows, samples), or (3, 1, samples) if all windows have the same.
-    held : weights (…, samples - 1) for an input that is held after each sample.
     """
 
     def __init__(self, t: Array, *, first: NDArray[np.intp] | slice, width: int) -> None:
         self.first, self.width = first, width
         # With an even clock, all windows have the weights of the first one.
         local = self.cut(t)[: 1 if is_even(t) else None]
-        span = local[:, -1:] - local[:, :1]
-        s = (local - local[:, :1]) / span
-        # The integral of the bump from 0 to s, over that from 0 to 1.
-        share = 630 * s**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], s)
-        self.held = np.diff(share, axis=1)
-        w, w1, w2 = bump(s, span=span)
-        dt = np.gradient(local, axis=1)
+        self._t, self._span = local, local[:, -1:] - local[:, :1]
+        self._s = (local - local[:, :1]) / self._span
+
+    @cached_property
+    def weights(self) -> Array:
+        """Weights for the mean, the rate of change and the curvature, (3, windows, samples).
+
+        All windows may share their weights, (3, 1, samples).
+        """
+        w, w1, w2 = bump(self._s, span=self._span)
+        dt = np.gradient(self._t, axis=1)
         size = (w * dt).sum(1, keepdims=True)
         w, w1, w2 = (weight * dt / size for weight in (w, w1, w2))
-        tau = local - (w * local).sum(1, keepdims=True)
+        tau = self._t - (w * self._t).sum(1, keepdims=True)
         spread = (w * tau**2).sum(1, keepdims=True)
         w2 = w2 - w * w2.sum(1, keepdims=True) - w * tau * (w2 * tau).sum(1, keepdims=True) / spread
         w2 = 2 * w2 / (w2 * tau**2).sum(1, keepdims=True)
         w1 = w1 - w * w1.sum(1, keepdims=True)
         w1 = w1 / (w1 * tau).sum(1, keepdims=True)
-        self.weights = np.array([w, w1, w2])
+        return np.array([w, w1, w2])
+
+    @cached_property
+    def _held(self) -> Array:
+        """Weights (…, samples - 1) for an input that is held after each sample."""
+        return np.diff(bump_integral(self._s), axis=1) / bump_integral(np.ones(1))
 
     def cut(self, x: Array) -> Array:
         """Return the samples (…, windows, samples) of signals (…, n)."""
         return sliding_window_view(x, self.width, axis=-1)[..., self.first, :]
+
+    def mean(self, x: Array) -> Array:
+        """Return the means (…, windows) of signals (…, n)."""
+        return _weighed(self.weights[0], self.cut(x))
 
     def means(self, x: Array) -> Array:
         """Return mean, rate of change and curvature (3, …, windows) of signals (…, n)."""
@@ -95,7 +107,7 @@ class Windows:
 
     def held_mean(self, u: Array) -> Array:
         """Return the means (…, windows) of inputs (…, n) that are held after each sample."""
-        return _weighed(self.held, self.cut(u)[..., :-1])
+        return _weighed(self._held, self.cut(u)[..., :-1])
 
     def gain(self, chain: Chain, cart: int) -> float:
         """Return the standard deviation of a cart's force that white noise of size 1 causes."""
@@ -107,7 +119,7 @@ class Windows:
 
 def _weighed(weights: Array, x: Array) -> Array:
     """Return weighted sums over windows (…, windows, samples), which may share their weights."""
-    return x @ weights[0] if len(weights) == 1 else (weights * x).sum(-1)
+    return x @ weights[0] if len(weights) == 1 else np.einsum("wi,...wi->...w", weights, x)
 
 
 def required_force(chain: Chain, means: Array) -> Array:
@@ -299,7 +311,7 @@ def _means(t: Array, y: Array, inputs: Array, first: NDArray[np.intp], width: in
     windows = Windows(t, first=first, width=width)
     return np.vstack(
         [
-            windows.means(t)[0],
+            windows.mean(t),
             windows.held_mean(inputs),
             np.broadcast_to(np.linalg.norm(windows.weights[2], axis=1), first.size),
             *windows.means(y),
@@ -695,7 +707,7 @@ def _products(
     own, slope, bend = windows.means(at(cart))
     right = [bend, slope, own, np.zeros(places.size)]
     if cart + 1 in record.free:
-        right[3] = windows.means(at(cart + 1, late=after))[0]
+        right[3] = windows.mean(at(cart + 1, late=after))
     before = np.correlate(at(cart - 1), windows.weights[0, 0])
     shifts = np.arange(-_MOST_LATE, _MOST_LATE + 1)
     left = before[places - shifts[:, None]]

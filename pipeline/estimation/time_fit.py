@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
-from pipeline.estimation.force_balance import Windows
+from pipeline.estimation.force_balance import bump, bump_integral
 from pipeline.estimation.least_squares import minimise
 from pipeline.estimation.noise import (
     local_noise,
@@ -313,9 +313,10 @@ def _real_part(weights: ComplexArray, signals: ComplexArray) -> Array:
 
 # -------------------------------------------------------- the search, from a regression's result
 #
-# For the start, each cart's equation of motion is averaged over windows (`force_balance`):
+# For the start, each cart's equation of motion is multiplied by a bump φ and integrated by parts
+# (`force_balance`). The result is
 #
-#     m_i x_i'' + c_i x_i' + k_i (x_i - x_{i-1}) + k_{i+1} (x_i - x_{i+1}) = u.
+#     m_i ∫ x_i φ'' - c_i ∫ x_i φ' + k_i ∫ (x_i - x_{i-1}) φ + k_{i+1} ∫ (x_i - x_{i+1}) φ = ∫ u φ.
 #
 # Cart 1's equation gives its mass, damping and springs in input units. The equation of each further
 # cart gives them relative to the spring before it. An encoder zero acts as a constant force in its
@@ -341,16 +342,16 @@ def regress_chain(windows: Sequence[FitWindow], *, bench: Setup, width: float) -
     """
     n = bench.n
     m, c, k = np.zeros(n), np.zeros(n), np.zeros(n + 1)
-    means = [_means(window, n=n, width=width) for window in windows]
+    moments = [_moments(window, n=n, width=width) for window in windows]
     for cart in range(1, n + 1):
         seen = [
-            mean
-            for window, mean in zip(windows, means, strict=True)
-            if mean is not None and _has_equation(window, cart, n)
+            moment
+            for window, moment in zip(windows, moments, strict=True)
+            if moment is not None and _has_equation(window, cart, n)
         ]
         if not seen:
             return None
-        rows, targets = zip(*(_equation(cart, bench, *mean) for mean in seen), strict=True)
+        rows, targets = zip(*(_equation(cart, bench, *moment) for moment in seen), strict=True)
         zeros = np.zeros((sum(map(len, rows)), len(rows)))  # a constant force in each record
         ends = np.cumsum([0, *map(len, rows)])
         for column, (first, last) in enumerate(pairwise(ends)):
@@ -381,36 +382,51 @@ def _equation(cart: int, bench: Setup, x: Array, force: Array) -> tuple[Array, A
     """Return the columns of m, c and the springs of a cart's equation, and its right side.
 
     The spring before the cart is a column only for cart 1; otherwise it is the right side. `x` (3,
-    n + 2, n_b) holds means of position, velocity and acceleration of walls and carts; `force`
-    (n_b,) holds means of the input.
+    n + 2, n_b) holds the moments of walls and carts with φ, φ', φ''; `force` (n_b,) holds the
+    moments of the input.
     """
     stretch = x[0, cart] - x[0, cart - 1], x[0, cart] - x[0, cart + 1]
-    columns = [x[2, cart], x[1, cart], stretch[1] * bench.stiff[cart]]
+    columns = [x[2, cart], -x[1, cart], stretch[1] * bench.stiff[cart]]
     if cart > 1:
         return np.stack(columns, axis=1), -stretch[0]
     columns.append(stretch[0] * bench.stiff[0])
     return np.stack(columns, axis=1), force
 
 
-def _means(window: FitWindow, *, n: int, width: float) -> tuple[Array, Array] | None:
-    """Return the means under bumps: (3, n + 2, n_b) of the motion, and (n_b,) of the input.
+def _moments(window: FitWindow, *, n: int, width: float) -> tuple[Array, Array] | None:
+    """Return the moments (3, n + 2, n_b) of the positions with φ, φ', φ'', and (n_b,) of the input.
 
-    Walls, held and unmeasured carts are at zero. The result is None if the record is shorter than
-    two bumps, or if a bump holds too few samples.
+    φ = (τ (1 - τ))⁴, with τ from 0 to 1 over the bump. Walls, held and unmeasured carts are at
+    zero. The result is None if the record is shorter than two bumps, or if a bump holds too few
+    samples.
     """
     t, duration = window.t, window.t[-1]
     if duration < 2 * width or t.size * width / duration < _FEWEST_IN_BUMP:
         return None
     count = min(int((duration - width) / (_HOP * width)) + 1, _MOST_BUMPS)
-    samples = round((t.size - 1) * width / duration)
-    first = np.linspace(0, t.size - 1 - samples, count).astype(int)
+    starts = np.linspace(0.0, duration - width, count)
+    around = _around(t, starts, width)
+    tau = np.clip((t[around] - starts[:, None]) / width, 0.0, 1.0)
+    bumps = np.stack(bump(tau, span=width))
+    bumps *= np.gradient(t)[around]  # trapezoidal rule, accurate because bumps end smoothly
     x = np.zeros((3, n + 2, count))
-    x[:, list(window.carts)] = Windows(t, first=first, width=samples + 1).means(window.y)
-    if window.drive_u is None:
-        return x, np.zeros(count)
-    stride = window.stride
-    drive = Windows(window.drive_t, first=first * stride, width=samples * stride + 1)
-    return x, drive.held_mean(window.drive_u)
+    for cart, y in zip(window.carts, window.y, strict=True):
+        x[:, cart] = np.einsum("dbi,bi->db", bumps, y[around])
+    force = np.zeros(count)
+    if window.drive_u is not None:
+        around = _around(window.drive_t, starts, width)
+        tau = np.clip((window.drive_t[around] - starts[:, None]) / width, 0.0, 1.0)
+        # ∫ φ between samples. The input is held between samples, so its moment is exact.
+        area = width * bump_integral(tau)
+        force = np.sum(window.drive_u[around][:, :-1] * np.diff(area, axis=1), axis=1)
+    return x, force
+
+
+def _around(t: Array, starts: Array, width: float) -> np.ndarray:
+    """Return indices (n_b, n_k) of the samples in each bump, and of one sample on either side."""
+    first = np.searchsorted(t, starts, side="right") - 1
+    last = np.searchsorted(t, starts + width, side="left")
+    return np.minimum(first[:, None] + np.arange(np.max(last - first) + 1), t.size - 1)
 
 
 def even_chains(windows: Sequence[FitWindow], *, bench: Setup) -> list[Chain]:

@@ -115,7 +115,7 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
             experiment=trace.experiment,
             cart=cart,
             held_out=trace.held_out,
-            t=windows.means(t)[0],
+            t=windows.mean(t),
             measured=force[0],
             model=force[1],
             u=logged,

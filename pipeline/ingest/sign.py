@@ -238,10 +238,10 @@ def _weigh(record: Record) -> _Weighed | None:
     width = int(np.clip(period, _NARROWEST, t.size // _BUMPS))
     last = x.size - width  # start of the last bump
     places = np.arange(1, last, max(width // 6, last // 400, 1))
-    windows = [Windows(grid, first=places + shift, width=width) for shift in (-1, 0, 1)]
-    position, velocity, acceleration = windows[1].means(x)
-    centred = [one.means(u)[0] for one in windows]
-    centred += [acceleration, velocity, position, windows[1].means(x - other)[0]]
+    windows = Windows(grid, first=places, width=width)
+    position, velocity, acceleration = windows.means(x)
+    centred = [windows.mean(np.roll(u, -shift)) for shift in (-1, 0, 1)]
+    centred += [acceleration, velocity, position, windows.mean(x - other)]
     early, now, late, *terms = (a - a.mean() for a in centred)  # offsets of the encoders cancel
     drive = np.array([early, now, late]) / np.linalg.norm(now)
     motion = np.array(terms).T / np.linalg.norm(now)
