@@ -59,6 +59,7 @@ from pipeline.words.quantities import Quantity, quantity_html, quantity_lines
 ExperimentKind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
 Hold = Literal["zero_order", "band_limited"]
 CheckOutcome = Literal["pass", "fail", "skip"]
+Exclusion = Literal["no", "odd", "wrong"]
 
 
 def passed(good: bool) -> CheckOutcome:
@@ -743,7 +744,7 @@ class Finding:
     details: Mapping[str, object] = field(default_factory=dict)
     value: float | None = None
     limit: float | None = None
-    excludes: Literal["no", "odd", "wrong"] = "no"
+    excludes: Exclusion = "no"
 
     @classmethod
     def from_written(cls, *, experiment: str, reason: str, is_wrong: bool) -> "Finding":
@@ -813,7 +814,7 @@ class ListedFinding:
     value: float | None = written(default=None)
     limit: float | None = written(default=None)
     message: str = written()
-    excludes: Literal["no", "odd", "wrong"] = written(
+    excludes: Exclusion = written(
         '"odd": differs from others, "wrong": shows something else', default="no"
     )
 
@@ -1217,7 +1218,9 @@ class Analysis:
     @computed()
     def findings(self) -> tuple[ListedFinding, ...]:
         """Everything that is wrong, open or noted, in one list."""
-        excludes = {(one.run, one.code): one.excludes for one in self.left_out}
+        excludes: dict[tuple[str, str], Exclusion] = {
+            (one.run, one.code): one.excludes for one in self.left_out
+        }
         checks = [
             ListedFinding(
                 code=one.code or one.kind,

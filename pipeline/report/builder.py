@@ -55,9 +55,8 @@ class PageBuilder:
         key: str,
         rows: Iterable[Sequence[Cell | str | Spans]],
         align: str,
-        /,
-        *,
         is_numbered: bool = True,
+        /,
         **values: object,
     ) -> Table:
         """Return a table with the next number; see `make_table`.

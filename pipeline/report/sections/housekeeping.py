@@ -75,7 +75,7 @@ def _check_table(
         ]
         for check in sorted(checks, key=lambda check: order.index(check.outcome))
     ]
-    return page.table(_WORDS, key, rows, "lll", is_numbered=is_numbered)
+    return page.table(_WORDS, key, rows, "lll", is_numbered)
 
 
 def assumption_blocks(page: Page) -> list[Block]:
@@ -113,7 +113,7 @@ def _assumption_table(
         ]
         for one in assumptions
     ]
-    return page.table(_WORDS, "assumption_table", rows, "llllll", is_numbered=is_numbered)
+    return page.table(_WORDS, "assumption_table", rows, "llllll", is_numbered)
 
 
 def taken_text(one: Assumption) -> str:
