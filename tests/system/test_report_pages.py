@@ -316,7 +316,7 @@ def test_numbers_can_be_copied(three, show):
 
     page.get_by_role("button", name="Copy Table 2").click()
     table = page.evaluate("navigator.clipboard.readText()")
-    page.get_by_role("button", name="Copy the matrices").first.click()
+    page.get_by_role("button", name="Copy these numbers").first.click()
     matrix = page.evaluate("navigator.clipboard.readText()")
 
     rows = [line.split("\t") for line in table.splitlines()]
