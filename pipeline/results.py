@@ -801,11 +801,12 @@ class Subject:
 
 @result()
 class ListedFinding:
-    """A failed check, a skipped stage or a warning, as files list it.
+    """A failed check, a wrong number, a skipped stage or a warning, as files list it.
 
     Attributes
     ----------
-    code : what is wrong. It is "skipped" for a stage, and "warning" for a warning.
+    code : what is wrong. It is "skipped" for a stage, "warning" for a warning, and "number_off" for
+        a student's number that disagrees with the recordings.
     excludes : whether the recording is used, as in `Finding`.
     """
 
@@ -1239,7 +1240,15 @@ class Analysis:
             for one in self.skipped
         ]
         warnings = [ListedFinding(code="warning", message=text) for text in self.warnings]
-        return (*checks, *skipped, *warnings)
+        typed = [
+            ListedFinding(
+                code="number_off",
+                about=Subject(parameter=name),
+                message=f"the number reported for {name} disagrees with the recordings",
+            )
+            for name in self.reported_off
+        ]
+        return (*checks, *typed, *skipped, *warnings)
 
     @computed(key="status")
     def state(self) -> ReportState:

@@ -147,7 +147,8 @@ def _read(submission: Submission, *, log: Log) -> tuple[Ingested, tuple[Interven
         log.skip(Stage.READING, reason, run=name)
     log.warn([f"not used, because it cannot be read: {part.message}" for part in submission.unread])
     log.warn(reading_remarks(data, unit=submission.system.bench.units.position))
-    left_out = [one.id for one in submission.experiments if one not in submission.used]
+    used = {one.id for one in submission.used}
+    left_out = [one.id for one in submission.experiments if one.id not in used]
     if left_out:
         log.warn([_WORDS.text("stated_left_out", runs=join_names(left_out))])
     interventions = find_interventions(data.records)

@@ -164,7 +164,8 @@ def brief_lines(text: str, *, width: int, most: int, more: str) -> list[str]:
     while sum(map(len, lines)) + 1 > most and (longest := max(lists, key=len, default=[])):
         lines[longest.pop(-2 if len(longest) > 2 else -1)] = []
         left_out += 1
-    return [*(line for one in lines for line in one), f"- {left_out} more: see {more}"]
+    shown = [line for one in lines for line in one]
+    return [*shown, f"- {left_out} more: see {more}"] if left_out else shown
 
 
 def _first_sentence(paragraph: str) -> str:

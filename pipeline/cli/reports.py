@@ -5,7 +5,8 @@ effects, schema.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -71,6 +72,7 @@ def inspect(
     )
 
     inspections, entries, unreadable = [], [], []
+    columns: dict[Path, Mapping[str, str | int]] = {}
     folders = [
         file / "data" if (file / "data").is_dir() else file for file in files if file.is_dir()
     ]
@@ -80,11 +82,12 @@ def inspect(
         listed += found
         if not found:
             unreadable.append(f"{folder}: contains no data files")
+        columns |= dict.fromkeys(found, _stated_columns(folder))
     with progress_line() as progress:
         for file in listed:  # a broken file must not hide the others
             progress(f"reading {file.name}")
             try:
-                runs = inspect_runs(file)
+                runs = inspect_runs(file, columns=columns.get(file, {}))
                 inspections += runs
                 entries += [one.to_dict() for one in runs]
             except PipelineError as error:
@@ -107,6 +110,16 @@ def inspect(
         say(f"cartlab: {message}")
     if unreadable or any(one.unusable for one in inspections):
         raise typer.Exit(1 if inspections else 2)
+
+
+def _stated_columns(data: Path) -> "Mapping[str, str | int]":
+    """Return the columns that the submission of a data folder states, if it can be read."""
+    from pipeline.submission import load_submission
+
+    for folder in (data, data.parent):
+        with suppress(PipelineError):
+            return load_submission(folder).system.columns
+    return {}
 
 
 @app.command()
@@ -431,6 +444,7 @@ def _simulate_team(
     out: Path, bench: "SimulatedBench", *, percent: float, secret: Path, seed: int, reported: bool
 ) -> None:
     """Write the submission of a team, whose bench only the answer key knows."""
+    from pipeline.json_files import json_text
     from pipeline.simulated.answer_key import changing_key, draw_bench
     from pipeline.simulated.submission import Students, write_submission
 
@@ -440,6 +454,11 @@ def _simulate_team(
     with changing_key(secret) as key, progress_line() as progress:
         rng = key.generator(team, seed=seed)
         own, answers = draw_bench(bench, percent=percent, rng=rng)
+        if (known := key.teams.get(team)) and json_text(known) != json_text(answers):
+            raise ConfigError(
+                f"{secret} has another bench for {team}, which this one would replace: give the "
+                "team's folder another name, or use another file"
+            )
         progress("simulating the experiments")
         noise = int(rng.integers(2**63))
         students = Students(title="Identification of carts on springs", is_anonymous=True)

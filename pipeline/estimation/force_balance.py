@@ -51,8 +51,8 @@ def motion_period(x: Array) -> float:
 class Windows:
     """Means over windows of a record, weighted by a bump.
 
-    With few samples the bump's derivatives are integrated badly. So the weights are corrected to be
-    exact for parabolas.
+    With few samples the bump's derivatives are integrated badly. So the weights are corrected:
+    curvatures are exact for parabolas, rates of change for straight lines.
 
     Parameters
     ----------

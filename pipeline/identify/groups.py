@@ -48,6 +48,7 @@ from pipeline.results import (
     RecordingGroup,
 )
 from pipeline.setup import Setup
+from pipeline.submission.models import is_named
 from pipeline.words.numbers import join_names, listing, with_error
 
 # Relative difference of a mass or spring that matters, and of a frequency, its square root.
@@ -68,7 +69,8 @@ _SAME_INPUT = 0.95  # share of another input's range that an equally large input
 # A date in the name of a file or folder, or the day of a time stamp.
 _DATE = re.compile(
     r"(?<!\d)\d{4}([-_.]?)[01]\d\1[0-3]\d(?!\d)|(?<!\d)\d{1,2}[-_.]\d{1,2}[-_.]\d{4}(?!\d)"
-    r"|(?<!\d)\d{1,2}[-_. ]?(?:jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*"
+    r"|(?<!\d)\d{1,2}[-_. ]?(?:jan(?:uary)?|feb(?:ruary)?|mar(?:ch)?|apr(?:il)?|may|june?|july?"
+    r"|aug(?:ust)?|sept?(?:ember)?|oct(?:ober)?|nov(?:ember)?|dec(?:ember)?)(?![a-z])"
     r"(?:[-_. ]?\d{4})?(?!\d)",
     re.IGNORECASE,
 )
@@ -534,11 +536,13 @@ def leave_out_line(groups: Sequence[RecordingGroup]) -> str:
     It is the largest group that nothing but its carts sets apart.
     """
     kept = next((group for group in groups if not group.remark), groups[0])
+    known = [name for group in groups for name in group.experiments]
     names: list[str] = []
     for group in groups:
-        by_day = group.label and all(group.label in name for name in group.experiments)
+        pattern = f"*{group.label}*"
+        is_exact = {name for name in known if is_named(name, pattern)} == {*group.experiments}
         if group is not kept:
-            names += [f"*{group.label}*"] if by_day else group.experiments
+            names += [pattern] if group.label and is_exact else group.experiments
     return f"leave_out = {json.dumps(names, ensure_ascii=False)}"
 
 

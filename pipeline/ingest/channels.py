@@ -49,13 +49,17 @@ def settles_at_input(u: Array, x: Array) -> bool:
     Under feedback, it does so if the column holds the set point. In open loop, this is chance.
     """
     edges = find_edges(u)
-    if not 0 < edges.size <= 20 or np.any(u % 1) or np.any(x % 1):
+    if not 0 < edges.size <= 20 or not (_are_counts(u) and _are_counts(x)):
         return False
     pieces = np.split(np.arange(u.size), edges)
     rest, moved = pieces[0], max(pieces[1:], key=lambda piece: abs(u[piece[0]] - u[0]) * piece.size)
     step = float(u[moved[0]] - u[0])
     settled = float(np.mean(x[moved[-(moved.size // 4 + 1) :]]) - np.median(x[rest]))
     return abs(step) >= _FEWEST_COUNTS and abs(abs(settled / step) - 1) < 0.03
+
+
+def _are_counts(x: Array) -> bool:
+    return bool(np.all(np.abs(x - np.rint(x)) < 1e-6))  # a scale leaves rounding errors
 
 
 def mirrors(reference: Array, x1: Array) -> bool:

@@ -91,7 +91,7 @@ def stability_margins(
     They mean the same as those of `control.stability_margins`. The margins are that of the gain (a
     factor), that of the phase in degrees, and the least distance of the Nyquist curve from -1. At
     the frequencies (rad/s) the phase is -180°, the gain is 1, and the curve is nearest to -1.
-    A margin without a limit is infinite, and its frequency is NaN. Unlike there, a limit at
+    A margin without a limit is infinite, and its frequency is NaN. A limit at
     frequency 0 counts: beyond it, the loop drifts away.
 
     Raises

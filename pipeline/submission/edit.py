@@ -104,7 +104,10 @@ def edit_submission(
             raise SubmissionError(f"{where}: would exceed {MAX_TOML_BYTES:,} bytes")
         submission = parse_submission(new, folder=folder, where=where)
         newline = "\r\n" if "\r\n" in text else "\n"
-        write_file(folder / NAME, new.replace("\n", newline))
+        content = new.replace("\n", newline).encode()
+        # A file that stays as it is keeps its time, so no report becomes out of date.
+        if (folder / NAME).read_bytes() != content:
+            write_file(folder / NAME, content)
         return submission
 
 

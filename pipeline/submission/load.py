@@ -7,7 +7,6 @@ import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
-from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -23,6 +22,7 @@ from pipeline.submission.models import (
     StateFeedbackController,
     Submission,
     Unread,
+    is_named,
 )
 from pipeline.submission.toml import (
     MOST_LISTED,
@@ -297,7 +297,7 @@ def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, 
         for key, what in _experiment_problems(experiment, n, folder):
             yield ("experiments", i, *key), what
     for i, pattern in enumerate(submission.leave_out):
-        if not any(fnmatchcase(name, pattern) for name in seen):
+        if not any(is_named(name, pattern) for name in seen):
             yield (
                 ("leave_out", i),
                 f"{quote(pattern)} names no experiment{nearest(pattern, [*seen])}",

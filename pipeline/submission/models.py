@@ -291,6 +291,11 @@ class Unread(TomlTable):
     message: str
 
 
+def is_named(name: str, pattern: str) -> bool:
+    """Return whether an entry of `leave_out`, an id or a pattern, names an experiment."""
+    return name == pattern or fnmatchcase(name, pattern)
+
+
 class Submission(TomlTable):
     """A validated submission; `folder` is the folder that contains it."""
 
@@ -327,7 +332,7 @@ class Submission(TomlTable):
         return tuple(
             one
             for one in self.experiments
-            if not any(fnmatchcase(one.id, pattern) for pattern in self.leave_out)
+            if not any(is_named(one.id, pattern) for pattern in self.leave_out)
         )
 
     @property

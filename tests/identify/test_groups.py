@@ -16,7 +16,7 @@ from pipeline.identify.groups import (
     steps_disagree,
 )
 from pipeline.plant.chain import PRESETS, Chain
-from pipeline.results import Record
+from pipeline.results import Record, RecordingGroup
 from pipeline.setup import Setup
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.simulated.submission import SimulatedSession, plan_steps, plan_sweep
@@ -120,3 +120,13 @@ def test_two_days_of_one_bench_are_one_group(preset, seed):
     bench = SimulatedBench(chain=chain, effects=effects)
     records, setup = days(bench, bench, seed=seed)
     assert not find_setups(records, bench=setup)
+
+
+def test_a_day_that_is_part_of_another_is_no_pattern():
+    """The pattern *7-Feb* would also leave out the recordings of 17-Feb, so ids are listed."""
+    groups = [
+        RecordingGroup(experiments=("17-Feb-a", "17-Feb-b"), values={}, std={}, label="17-Feb"),
+        RecordingGroup(experiments=("7-Feb-a",), values={}, std={}, label="7-Feb"),
+    ]
+    assert leave_out_line(groups) == 'leave_out = ["7-Feb-a"]'
+    assert leave_out_line(groups[::-1]) == 'leave_out = ["*17-Feb*"]'

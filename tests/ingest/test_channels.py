@@ -114,4 +114,5 @@ def test_a_set_point_in_the_input_column_is_seen(gain, settles):
     rise = np.exp(-3.0 * np.clip(T - 1.0, 0.0, 4.0)) * np.cos(20.0 * (T - 1.0))
     x = np.round(gain * u * (1.0 - rise)) + 40.0
     assert settles_at_input(u, x) == settles
+    assert settles_at_input(u, (0.00227 * x) / 0.00227) == settles  # counts, but for rounding
     assert not settles_at_input(u / 1000.0, x)

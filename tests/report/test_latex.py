@@ -68,7 +68,11 @@ def test_amounts_of_money_and_code_stay_text(text):
     "latex",
     [
         r"\foo x",
+        r"{}",
         r"\frac{1",
+        r"\frac{a}{b",
+        r"\sqrt{k",
+        r"\dot " * 60 + "x",
         r"{",
         r"x^",
         r"a & b",

@@ -90,12 +90,14 @@ def test_the_file_lists_every_finding():
     odd = Finding(code="quoted", run="b", details={"reason": "it differs"}, excludes="odd")
     bad = replace(BAD, value=3.0, limit=1.0, code="quoted")
     noted = replace(
-        GOOD, checks=(bad,), skipped=(skipped,), warnings=("mind the gap",), left_out=(odd,)
-    )
+        GOOD, checks=(bad,), skipped=(skipped,), warnings=("mind the gap",), left_out=(odd,),
+        reported_off=("K",),
+    )  # fmt: skip
     listed = json.loads(json_text(noted))["findings"]
     nobody = {"experiment": None, "cart": None, "parameter": None}
     assert [(one["code"], one["about"], one["value"], one["excludes"]) for one in listed] == [
         ("quoted", nobody | {"experiment": "b"}, 3.0, "odd"),
+        ("number_off", nobody | {"parameter": "K"}, None, "no"),
         ("skipped", nobody | {"cart": 2}, None, "no"),
         ("warning", nobody, None, "no"),
     ]

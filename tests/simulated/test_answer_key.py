@@ -75,6 +75,14 @@ def test_the_same_key_draws_the_same_bench(teams, tmp_path):
     assert copy.read_bytes() == key
 
 
+def test_another_bench_does_not_replace_the_answers_of_a_team(teams, tmp_path):
+    """A folder of the same name with another draw is refused, and the key stays as it is."""
+    before = (teams / "key.json").read_bytes()
+    again = simulate(tmp_path / "a", teams / "key.json", "--seed", "5")
+    assert again.returncode == 2
+    assert (teams / "key.json").read_bytes() == before
+
+
 def test_drawn_values_fill_the_range():
     """Factors lie within the percentage and use its whole width; no effect changes its sign."""
     hidden = ("stiction:cart=1", "sensor_gain:cart=1,gain=1.1", "end_stop:cart=1,position=-0.8")

@@ -404,7 +404,7 @@ id = "14-Feb-a"
 kind = "decay"
 file = "a.csv"
 [[experiments]]
-id = "21-Feb-b"
+id = "21-Feb[b]"
 kind = "decay"
 file = "b.csv"
 """
@@ -413,9 +413,9 @@ file = "b.csv"
 @pytest.mark.parametrize(
     ("names", "used"),
     [
-        ("", ["14-Feb-a", "21-Feb-b"]),
-        ('"14-Feb-*"', ["21-Feb-b"]),
-        ('"21-Feb-b"', ["14-Feb-a"]),
+        ("", ["14-Feb-a", "21-Feb[b]"]),
+        ('"14-Feb-*"', ["21-Feb[b]"]),
+        ('"21-Feb[b]"', ["14-Feb-a"]),
         ('"22-Feb-*"', None),
         ('"*"', None),
     ],

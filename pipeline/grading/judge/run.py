@@ -273,8 +273,12 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
             "columns": {**set_.columns, **own.columns},
         }
     )
-    experiments = tuple(_under_calibration(e, set_) for e in submission.experiments)
-    if experiments != submission.experiments:
+    # A recording that the submission leaves out counts as not handed in.
+    used = submission.used
+    if len(used) < len(submission.experiments):
+        notes.append("recordings that the submission leaves out count as not handed in")
+    experiments = tuple(_under_calibration(e, set_) for e in used)
+    if experiments != used:
         notes.append("the scale of the input is the rubric's, even if a recording states its own")
     update = {
         "system": system,

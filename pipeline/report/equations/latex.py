@@ -22,6 +22,7 @@ from pipeline.words.math import (
     power,
     row,
     sub,
+    to_text,
     upright,
 )
 from pipeline.words.text import clean
@@ -30,6 +31,7 @@ _LONGEST = 1000  # characters of a formula
 _DEEPEST = 24  # levels of nesting; typst limits the depth of calls
 # Definitions could be nested so that a short formula becomes gigabytes.
 _DEFINES = re.compile(r"\\(?:def|(?:re)?newcommand|DeclareMathOperator)(?![A-Za-z])")
+_BRACE = re.compile(r"\\\\|\\[{}]")  # what is no brace of a group
 _ALIGNED = re.compile(r"(\\(?:begin|end)\s*)\{(?:align\*?|aligned|split|eqnarray\*?)\}")
 _UNKNOWN = re.compile(r"\\([A-Za-z]+)")
 _DOTS = {"˙": "dot", "¨": "ddot"}
@@ -64,19 +66,23 @@ def read_latex(latex: str, *, display: bool = False) -> Math:
         raise LatexError(f"it has more than {_LONGEST:,} characters")
     if found := _DEFINES.search(latex):
         raise LatexError(f"{found[0]} is not known here")
+    if _BRACE.sub("", latex).count("{") != _BRACE.sub("", latex).count("}"):
+        raise LatexError("its braces do not match")
     aligned = _ALIGNED.sub(r"\1{align*}", latex)
     try:
-        return row(*_terms(convert_to_element(aligned, display="block" if display else "inline")))
+        math = row(*_terms(convert_to_element(aligned, display="block" if display else "inline")))
     except LatexError:
         raise
     except Exception:  # latex2mathml ends with any of a dozen exceptions
         raise LatexError("it cannot be read as LaTeX") from None
+    if not to_text(math).strip():
+        raise LatexError("it is empty")
+    return math
 
 
 def _terms(element: Element, depth: int = 0) -> list[Term]:
     """Return the children of an element."""
-    if depth > _DEEPEST:
-        raise LatexError("it is nested too deeply")
+    _refuse_deep(depth)
     terms: list[Term] = []
     for child in element:
         if child.tag in ("mrow", "mstyle") and not _is_fenced(child):
@@ -86,7 +92,13 @@ def _terms(element: Element, depth: int = 0) -> list[Term]:
     return _with_spaces(_with_brackets(_with_words(terms)))
 
 
+def _refuse_deep(depth: int) -> None:
+    if depth > _DEEPEST:
+        raise LatexError("it is nested too deeply")
+
+
 def _term(element: Element, depth: int) -> Term:
+    _refuse_deep(depth)
     text = clean(unescape(element.text or ""))
     match element.tag:
         case "mi" | "mn" | "mo":
@@ -105,7 +117,7 @@ def _term(element: Element, depth: int) -> Term:
             return _table(element, depth)
         case "msqrt":
             return Math("sqrt", (_row(element, depth),))
-    return _compound(element.tag, [_inside(child, depth) for child in element])
+    return _compound(element.tag, [_inside(child, depth + 1) for child in element])
 
 
 def _compound(tag: str, parts: Sequence[Term]) -> Term:

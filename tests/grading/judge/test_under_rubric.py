@@ -204,3 +204,21 @@ def test_report_check_and_grade_see_the_same_recordings(tmp_path):
     assert graded.grade == before.grade
     assert graded.grade.points == 20
     assert check_numbers(submission, rubric=rubric).disagree == ()
+
+
+def test_recordings_that_are_left_out_count_as_not_handed_in(tmp_path):
+    """Files that a submission leaves out earn no points, whatever they contain."""
+    folder = tmp_path / "team"
+    write_submission(folder, "throne-1dof", seed=3, compact=True, reported=True)
+    for path in (folder / "data").glob("sine-*.csv"):
+        path.write_text("garbage", "utf-8")
+    toml = folder / "submission.toml"
+    toml.write_text('leave_out = ["sine-*"]\n' + toml.read_text("utf-8"), "utf-8", newline="\n")
+    rubric = load_rubric(Path("throne-1dof"))
+
+    grade = grade_submission(load_submission(folder), rubric=rubric, name="team").grade
+
+    points = {one.id: one.points for one in grade.criteria}
+    assert points["dwells"] == 0
+    assert "missing" in {flag.code for flag in grade.flags}
+    assert any("leaves out" in note for note in grade.notes)
