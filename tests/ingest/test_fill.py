@@ -552,3 +552,23 @@ def test_each_run_of_a_file_gets_an_experiment(tmp_path):
     records = read_data(load_submission(tmp_path)).records
     assert [record.t.size for record in records] == [60, 60]
     assert [one.state for one in fill_submission(tmp_path)] == ["there", "there"]
+
+
+def test_stated_columns_count_for_inspect_and_a_full_file_is_not_written_again(tmp_path):
+    """`inspect` reads a folder with its stated columns; `fill` leaves a complete file untouched."""
+    (tmp_path / "data").mkdir()
+    t = np.arange(400) / 100
+    rows = np.column_stack([t, np.round(5 * np.exp(-t) * np.cos(20 * t), 3)])
+    np.savetxt(
+        tmp_path / "data" / "swing.csv", rows, delimiter=",", header="t / s,carriage", comments=""
+    )
+    toml = tmp_path / "submission.toml"
+    stated = 'columns = { time = "t / s", x1 = "carriage" }'
+    toml.write_text(f"version = 1\n[system]\ncarts = 1\n{stated}\n", encoding="utf-8")
+
+    (entry,) = json.loads(cartlab_here("inspect", tmp_path, "--json").stdout)
+    assert entry["kind"] == "decay"
+    assert cartlab_here("fill", tmp_path).returncode == 0
+    before = toml.stat().st_mtime_ns
+    assert cartlab_here("fill", tmp_path).returncode == 0
+    assert toml.stat().st_mtime_ns == before
