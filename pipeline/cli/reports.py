@@ -444,7 +444,6 @@ def _simulate_team(
     out: Path, bench: "SimulatedBench", *, percent: float, secret: Path, seed: int, reported: bool
 ) -> None:
     """Write the submission of a team, whose bench only the answer key knows."""
-    from pipeline.json_files import json_text
     from pipeline.simulated.answer_key import changing_key, draw_bench
     from pipeline.simulated.submission import Students, write_submission
 
@@ -454,16 +453,11 @@ def _simulate_team(
     with changing_key(secret) as key, progress_line() as progress:
         rng = key.generator(team, seed=seed)
         own, answers = draw_bench(bench, percent=percent, rng=rng)
-        if (known := key.teams.get(team)) and json_text(known) != json_text(answers):
-            raise ConfigError(
-                f"{secret} has another bench for {team}, which this one would replace: give the "
-                "team's folder another name, or use another file"
-            )
+        key.enter(team, answers)
         progress("simulating the experiments")
         noise = int(rng.integers(2**63))
         students = Students(title="Identification of carts on springs", is_anonymous=True)
         write_submission(out, own, seed=noise, reported=reported, students=students)
-        key.teams[team] = answers
     say(f"wrote {out}, and its true values to {secret}")
 
 

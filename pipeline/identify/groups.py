@@ -424,9 +424,7 @@ def _contradict(one: _Setup, other: _Setup) -> bool:
         return less or any(_covers(b, a) if fewer_held else _covers(a, b) for a, b in pairs)
     if not less and not any(_covers(a, b) and _covers(b, a) for a, b in pairs):
         return False
-    sizes = [[float(np.ptp(r.position(1))) for r in x.members] for x in (one, other)]
-    alike = all(min(a) <= _FARTHER * max(b) for a in sizes for b in sizes)
-    if not alike and not less:
+    if not less and not _overlap([one.members, other.members]):
         return False
     for members, chain in ((other.members, one.chain), (one.members, other.chain)):
         fits = record_fits(members, chain)

@@ -20,7 +20,7 @@ from pipeline.json_files import json_text, result, written
 from pipeline.lock import lock_when_free
 from pipeline.output import write_file
 from pipeline.plant.chain import Chain
-from pipeline.plant.effect import EffectTerm
+from pipeline.plant.effect import AugmentedChain, EffectTerm
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.submission.toml import read_text
 
@@ -34,11 +34,11 @@ class TeamBench:
 
     Attributes
     ----------
+    model : its carts, springs and effects, in the form of a `gap.json`.
     parameters : the true values of the report's parameters.
     """
 
-    chain: Chain = written()
-    effects: tuple[EffectTerm, ...] = written(default=())
+    model: AugmentedChain = written()
     parameters: dict[str, float] = written("true values of the report's parameters")
 
 
@@ -54,6 +54,20 @@ class AnswerKey:
         """Return the random numbers of a team."""
         drawn = hashlib.sha256(f"{self.secret}\0{team}\0{seed}".encode()).digest()
         return np.random.default_rng(int.from_bytes(drawn, "big"))
+
+    def enter(self, team: str, bench: TeamBench) -> None:
+        """Add the bench of a team.
+
+        Raises
+        ------
+        ConfigError : the key has another bench for this team.
+        """
+        known = self.teams.setdefault(team, bench)
+        if json_text(known) != json_text(bench):
+            raise ConfigError(
+                f"the answer key has another bench for {team}: give the team's folder another "
+                "name, or use another key"
+            )
 
 
 @contextmanager
@@ -119,7 +133,8 @@ def draw_bench(
     except DataError:  # no spring to a wall, so there are no static gains
         parameters = {}
     own = replace(bench, chain=drawn, effects=effects, effect_sentences=(), name="")
-    return own, TeamBench(chain=drawn, effects=effects, parameters=parameters)
+    model = AugmentedChain(chain=drawn, terms=effects)
+    return own, TeamBench(model=model, parameters=parameters)
 
 
 def _scaled(term: EffectTerm, factor: float) -> EffectTerm:

@@ -29,7 +29,6 @@ from pipeline.words.numbers import first_few
 
 _DEEPEST = 12  # levels of folders that are searched in a hand-in
 _ARCHIVES_IN_ARCHIVES = 3
-_CHUNK = 1 << 20
 _FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # so that the same files give the same archive
 
 

@@ -185,7 +185,6 @@ def _default_rubric(submission: Submission) -> Rubric:
     return Rubric(version=1, system=system, criteria=shipped.criteria if shipped else criteria)
 
 
-_TABLES = ("initial", "final")
 # Mistakes in reading a decay or a step. If a final table has one, the hint names decays and steps.
 _OF_TIME_RECORDS: tuple[MistakeKind, ...] = ("peak_count", "log10_for_ln", "peak_for_steady_state")
 # Mistakes that no part of a recording can show.
