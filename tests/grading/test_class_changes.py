@@ -242,7 +242,11 @@ def test_a_corrected_id_in_another_folder_flags_nobody(school, tmp_path):
         if inside == "lab":
             give(out, "lab", 0.25)
         else:  # a folder under another id belongs to another team, and a message says so
-            assert any("'s1'" in r and "'s 1'" in r for r in done[0].remarks)
+            (remark,) = (r for r in done[0].remarks if "'s1'" in r and "'s 1'" in r)
+            with Gradebook(out) as book:
+                dropped = [e.text for e in book.history("lab-final")[1] if e.what == "dropped"]
+            assert [text in remark for text in dropped] == [True]
+            assert "0.25 by " in dropped[0]
     assert {name: row["authors"] for name, row in rows(out).items()} == {
         "lab-final": "s1", "other": "s0",
     }  # fmt: skip

@@ -286,9 +286,12 @@ def _class_messages(batch: Batch, book: Gradebook, *, shown: Callable[[str], str
         yield f"{shown(before)} is now called {shown(now)}; its points given by hand are kept"
     for name, before, now in batch.taken_over:
         whose = "" if hidden else f", {_people(now)} in place of {_people(before)}"
+        events = book.history(batch.moved.get(name, name))[1]
+        dropped = [e.text for e in events if e.what == "dropped" and e.at == events[-1].at]
+        points = f"points by hand no longer count ({dropped[0]}); " if dropped else ""
         yield (
-            f"{shown(name)} now has other authors{whose}: if both submissions count, rename one "
-            f"folder"
+            f"{shown(name)} now has other authors{whose}: {points}if both submissions count, "
+            f"rename one folder"
         )
     if not batch.kept:
         return

@@ -33,7 +33,8 @@ class Event:
 
     The history also has events of the grader. `graded` is a grading by the rubric alone. `listed`
     is a new or changed line of a class list, with shared data and points by hand. `removed` is the
-    removal from the class list.
+    removal from the class list. `dropped` and `restored` say that points by hand no longer count,
+    or count again, because the authors changed.
 
     Attributes
     ----------
@@ -51,6 +52,7 @@ class Event:
     what: Literal[
         "override", "comment", "adjusted", "asked", "answered", "reopened", "reviewed",
         "unreviewed", "released", "hidden", "graded", "listed", "removed",
+        "dropped", "restored",
     ]  # fmt: skip
     criterion: str = ""
     points: float | None = None

@@ -46,6 +46,7 @@ def read_history(
         *_graded(connection, submission),
         *(_shown(event, named=named) for event in done if event.what in POINTS + REQUESTS),
         *_listed(connection, submission, named=named),
+        *_passed(connection, submission, [event for event in done if event.what in POINTS]),
     ]
     found = found if named else [_renamed(event, name, shown_as) for event in found]
     return sorted(found, key=lambda event: event.at)
@@ -114,6 +115,50 @@ def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator
         before, judged_by = (points, out_of, shared), rubric
 
 
+def _passed(connection: Connection, submission: int, given: Sequence[Event]) -> Iterator[Event]:
+    """Yield when points given by hand stop to count because the authors changed, or count again.
+
+    Parameters
+    ----------
+    given : all changes by hand of the submission's points, oldest first.
+    """
+    lists = select(batches.c.at, gradings.c.authors)
+    lists = lists.select_from(entries.join(batches).join(gradings))
+    lists = lists.where(entries.c.submission_id == submission).order_by(batches.c.id)
+    before: tuple[str, ...] = ()  # all that came with a team from its earlier name counted there
+    for at, authors in connection.execute(lists):
+        earlier = [event for event in given if event.at < at]
+        counted, counts = _counted(earlier, before), _counted(earlier, authors)
+        changed = {
+            "dropped": [event for event in counted if event not in counts],
+            "restored": [event for event in counts if event not in counted],
+        }
+        for what, points in changed.items():
+            if points:
+                yield Event(at=at, what=what, text="; ".join(map(_points_words, points)))
+        before = authors
+
+
+def _counted(given: Sequence[Event], authors: tuple[str, ...]) -> list[Event]:
+    """Return the points by hand, comments and adjustments that count for these authors."""
+    theirs = [event for event in given if event.concerns(authors)]
+    last = {event.criterion: event for event in theirs if event.what != "adjusted"}
+    removed = [e for e in last.values() if e.what == "override" and e.points is None]
+    return [
+        event
+        for event in theirs
+        if event.what == "adjusted" or event in last.values()
+        if event not in removed
+    ]
+
+
+def _points_words(event: Event) -> str:
+    if event.what == "adjusted":
+        return f"total {event.points:+g} by {event.by}"
+    what = "comment" if event.what == "comment" else f"{event.points:g}"
+    return f"{event.criterion}: {what} by {event.by}"
+
+
 def _other_name(
     connection: Connection, submission: int, *, of: int | None, among: int | None
 ) -> str:
@@ -171,6 +216,10 @@ def event_words(event: Event) -> str:
         return f"comment   {event.criterion}: by {event.by}: {event.text}"
     if event.what == "removed":
         return f"removed   {event.text}"
+    if event.what == "dropped":
+        return f"dropped   given to earlier authors, no longer counts: {event.text}"
+    if event.what == "restored":
+        return f"restored  given to these authors, counts again: {event.text}"
     if event.what in ("asked", "answered", "reopened"):
         return _request_words(event)
     note = f"  ({event.text})" if event.text else ""

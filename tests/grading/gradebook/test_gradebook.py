@@ -320,6 +320,22 @@ def test_the_history_gives_the_new_name_of_a_team(open_book):
     assert said["c"] == ["", ""]
 
 
+def test_the_history_says_when_points_by_hand_do_not_count(open_book):
+    """Points by hand end to count with other authors, and count again with the same."""
+    book = open_book()
+    finish(book, make_grade("team-1", share=0.0, authors=("ann",)))
+    for points in (0.5, 1.0):
+        book.override("team-1", "pieces", points, why="seen", by="Ada")
+    book.adjust("team-1", -2.0, why="late", by="Ada")
+    for run, who in enumerate((("ann", "bo"), ("anne",), ("anne",), ("ann",))):
+        finish(book, make_grade("team-1", share=0.0, authors=who), key=f"run {run}")
+    name, events = book.history("team-1")
+    told = [e for e in events if e.what in ("dropped", "restored")]
+    assert [event.what for event in told] == ["dropped", "restored"]
+    assert all("pieces: 1 by Ada; total -2 by Ada" in event.text for event in told)
+    assert history_text(name, events).count("dropped ") == 1
+
+
 def test_teams_are_accepted_together_as_they_were_seen(book):
     """A team that got another event or another grading since it was listed is left out."""
     finish(book, *(make_grade(name, share=0.5) for name in ("team-1", "team-2", "team-3")))
