@@ -1124,7 +1124,7 @@ class Analysis:
     fit : the fitted chain; if it is None, `skipped` says why.
     files : the SHA-256 of each data file.
     unreadable : for each experiment that could not be read, the reason.
-    unread : the line and the reason for each reported number or table that could not be read.
+    unread : the place and the reason for each part of submission.toml that could not be used.
     unexplained : for each driven recording with motion, the share of its power that the fitted
         carts do not explain.
     discussion : `notes.md`, without its comments.

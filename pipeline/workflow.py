@@ -127,7 +127,7 @@ def analyse(
         warnings=(),
         files=data.files,
         unreadable=data.unreadable,
-        unread=tuple(part.message for part in submission.unread),
+        unread=(*filter(None, [data.misnamed]), *(part.message for part in submission.unread)),
         unexplained={name: one.share for name, one in found.fitted.fits.items()},
         discussion=submission.discussion,
         left_out=tuple(left_out),
@@ -146,6 +146,7 @@ def _read(submission: Submission, *, log: Log) -> tuple[Ingested, tuple[Interven
     for name, reason in data.unreadable.items():
         log.skip(Stage.READING, reason, run=name)
     log.warn([f"not used, because it cannot be read: {part.message}" for part in submission.unread])
+    log.warn([data.misnamed])
     log.warn(reading_remarks(data, unit=submission.system.bench.units.position))
     used = {one.id for one in submission.used}
     left_out = [one.id for one in submission.experiments if one.id not in used]

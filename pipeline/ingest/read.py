@@ -1,8 +1,9 @@
 """Read the files of a submission into records; all conversions of units happen here."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from typing import Literal
 
 import numpy as np
@@ -27,8 +28,11 @@ from pipeline.ingest.sign import Signs, with_signs
 from pipeline.ingest.table import FileTable, Note, refuse_extreme
 from pipeline.results import FrequencyResponse, HeadingUnit, Record
 from pipeline.submission import Experiment, Submission, System
+from pipeline.submission.load import NAME
+from pipeline.words.numbers import count, first_few, listing
 
 _FEW_COUNTS = 10  # counts; no motor moves with so few, so smaller whole numbers are volts
+_MOST_NAMES = 12  # columns named in a warning
 DUTY_COUNT = 5 / 4096  # V; the amplifier of the UCSD bench gives 5 V for 4096 counts
 _NEED_INPUT = ("step", "sine", "sweep")
 
@@ -45,6 +49,7 @@ class Ingested:
     unreadable : for each experiment whose file is not used, the reason: the file is missing,
         broken, or from another experiment.
     signs : the stated signs of the inputs, and the signs found in the data.
+    misnamed : which columns of `[system] columns` no file has, or "".
     warnings : the warnings that concern more than one record.
     """
 
@@ -53,6 +58,7 @@ class Ingested:
     files: dict[str, str]
     unreadable: dict[str, str]
     signs: Signs
+    misnamed: str = ""
     warnings: tuple[str, ...]
 
 
@@ -104,9 +110,11 @@ def read_data(submission: Submission) -> Ingested:
     for one, clock in zip(opened, clocks, strict=True):
         with _noted(one.experiment, unreadable):
             records.append(_read_record(one, clock))
+    misnamed = _misnamed_columns(system, [table for read, _ in tables.values() for table in read])
     if len(unreadable) == len(experiments):
         (name, reason), *others = unreadable.items()
-        raise SubmissionError(f"{name}: {reason}{f' (and {len(others)} more)' if others else ''}")
+        reason = f"{name}: {reason}{f' (and {len(others)} more)' if others else ''}"
+        raise SubmissionError("; ".join(filter(None, [misnamed, reason])))
     per_count = system.input.per_count
     driven = [record for record in records if record.u is not None and np.any(record.u)]
     if per_count is not None and driven and all(r.input_scale != per_count for r in driven):
@@ -133,8 +141,31 @@ def read_data(submission: Submission) -> Ingested:
         files={name: digest for name, (_, digest) in sorted(tables.items())},
         unreadable=unreadable,
         signs=signs,
+        misnamed=misnamed,
         warnings=(*warnings, *found, *((spread,) if responses else ())),
     )
+
+
+def _misnamed_columns(system: System, tables: Sequence[FileTable]) -> str:
+    """Return which columns of `[system] columns` no file has, or ""."""
+    wrong = {
+        role: column
+        for role, column in system.columns.items()
+        if tables and not any(table.has(column) for table in tables)
+    }
+    if not wrong:
+        return ""
+    names = list(dict.fromkeys(name for table in tables for name in table.names))
+    most = max(len(table.names) for table in tables)
+    stated = []
+    for role, column in wrong.items():
+        close = get_close_matches(column, names, n=1) if isinstance(column, str) else []
+        meant = f" (did you mean {close[0]!r}?)" if close else ""
+        stated.append(f"{role} = {column!r}{meant}")
+    there = f"the files have at most {count(most, 'column')}: {first_few(names, _MOST_NAMES)}"
+    is_in = "is in no file" if len(wrong) == 1 else "are in no file"
+    said = f"{NAME}: [system] columns: {listing(stated)} {is_in}; {there}"
+    return Note(said, "no_column", about=", ".join(wrong))
 
 
 @contextmanager

@@ -265,6 +265,28 @@ def test_an_unneeded_scale_is_reported(content, tmp_path):
     assert [*facts(data.warnings)] == ["per_count_unused"]
 
 
+@pytest.mark.parametrize(
+    ("stated", "unused"),
+    [
+        ('{ input = "input", x1 = 3 }', None),
+        ('{ input = "Input", x1 = "Weg", x2 = 9 }', "x1, x2"),
+    ],
+)
+def test_columns_of_all_files_that_no_file_has_are_reported(stated, unused, tmp_path):
+    """A warning names the key of `[system] columns` and the columns that exist."""
+    system = f"columns = {stated}"
+    data = read(tmp_path, system, STEP, csv(time=T, input=U, x1=X1))
+    found = [(note.code, note.about) for note in facts([data.misnamed]).values()]
+    assert found == ([("no_column", unused)] if unused else [])
+    assert ("time, input, x1" in data.misnamed) == bool(unused)
+
+
+def test_a_wrong_column_of_all_files_is_named_if_nothing_can_be_read(tmp_path):
+    """If no file can be read, the error names the wrong key of `[system] columns` first."""
+    with pytest.raises(SubmissionError, match=r"columns: x1 = 'Wge' .did you mean 'Weg'"):
+        read(tmp_path, 'columns = { x1 = "Wge" }', STEP, csv(time=T, input=U, Weg=X1))
+
+
 def test_an_effort_with_fractions_is_in_volts(tmp_path):
     """An effort with fractions is taken as volts, not as duty counts."""
     record = read(tmp_path, "", STEP, bench_log(U)).records[0]

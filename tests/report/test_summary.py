@@ -156,6 +156,19 @@ def test_without_runs_of_all_carts_the_summary_says_what_to_record(drop):
     assert every_failed_check_is_named(analysis)
 
 
+def test_a_column_that_no_file_has_comes_first():
+    """What cannot be used in submission.toml comes before the failures that it may cause."""
+    submission = recorded("one-cart", "step", "decay")
+    system = submission.system.model_copy(update={"columns": {"input": "Motr"}})
+    analysis = analyse(submission.model_copy(update={"system": system}))
+    assert analysis.unread
+    assert {*analysis.unread} <= {*analysis.warnings}
+    off = Check(kind="order", outcome="fail", value=1.0, limit=0.5, message="Odd.")
+    first, second, *_ = next_part(replace(analysis, checks=(off,)))
+    assert "'Motr'" in first
+    assert off.id in second
+
+
 def test_no_failure_is_listed_if_no_check_failed():
     """If no check failed, neither the summary nor the section on checks lists a failure."""
     analysis = analysed("one-cart")

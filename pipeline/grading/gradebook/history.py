@@ -129,13 +129,10 @@ def _passed(connection: Connection, submission: int, given: Sequence[Event]) -> 
     for at, authors in connection.execute(lists):
         earlier = [event for event in given if event.at < at]
         counted, counts = _counted(earlier, before), _counted(earlier, authors)
-        changed = {
-            "dropped": [event for event in counted if event not in counts],
-            "restored": [event for event in counts if event not in counted],
-        }
-        for what, points in changed.items():
-            if points:
-                yield Event(at=at, what=what, text="; ".join(map(_points_words, points)))
+        if gone := [event for event in counted if event not in counts]:
+            yield Event(at=at, what="dropped", text=_points_words(gone))
+        if back := [event for event in counts if event not in counted]:
+            yield Event(at=at, what="restored", text=_points_words(back))
         before = authors
 
 
@@ -152,11 +149,15 @@ def _counted(given: Sequence[Event], authors: tuple[str, ...]) -> list[Event]:
     ]
 
 
-def _points_words(event: Event) -> str:
-    if event.what == "adjusted":
-        return f"total {event.points:+g} by {event.by}"
-    what = "comment" if event.what == "comment" else f"{event.points:g}"
-    return f"{event.criterion}: {what} by {event.by}"
+def _points_words(given: Sequence[Event]) -> str:
+    told = []
+    for event in given:
+        points = "" if event.points is None else f"{event.points:g}"
+        if event.what == "adjusted":
+            told.append(f"total {event.points:+g} by {event.by}")
+        else:
+            told.append(f"{event.criterion}: {points or 'comment'} by {event.by}")
+    return "; ".join(told)
 
 
 def _other_name(

@@ -447,7 +447,7 @@ def next_steps(
     open_questions : the questions that the students have not answered.
     has_links : whether the questions are on the same page.
     """
-    steps = [*_failed(analysis), *_advice(analysis)]
+    steps = [*_unread(analysis), *_failed(analysis), *_advice(analysis)]
     if open_questions:
         steps.append(_to_answer(analysis, open_questions, has_links=has_links))
     return bullet_list(steps or [_nothing_left(analysis)])
@@ -465,6 +465,13 @@ def _to_answer(analysis: Analysis, asked: Sequence[Asked], *, has_links: bool) -
     )
     questions = count(len(asked), "question")
     return _WORDS.spans("next_answer", questions=questions, ids=tuple(ids), nearly=nearly)
+
+
+def _unread(analysis: Analysis) -> Iterator[Spans]:
+    """Yield which parts of submission.toml cannot be used, as failed checks may come from them."""
+    if analysis.unread:
+        lines = rich(clean("; ".join(analysis.unread[:_MOST_TOLD])))
+        yield _WORDS.spans("next_unread", lines=lines)
 
 
 def _failed(analysis: Analysis) -> Iterator[Spans]:
@@ -542,8 +549,6 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     """Yield further advice that does not come from a failed check."""
     say, fit, design = _WORDS.spans, analysis.fit, analysis.feedback
     asked = {_group(check) for check in analysis.failed_checks}
-    if analysis.unread:
-        yield say("next_unread", lines=rich(clean("; ".join(analysis.unread[:_MOST_TOLD]))))
     if analysis.reported_off:
         yield say("next_reported", names=names_spans([*analysis.reported_off]))
     if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
