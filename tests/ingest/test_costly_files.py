@@ -106,8 +106,10 @@ from pipeline.processes import limited_memory
 
 folder = Path(sys.argv[1])
 enough = files.MOST_MEMORY
-with limited_memory(20_000_000), pytest.raises(MemoryError):  # the limit of a whole submission
+# Here is the limit of a whole submission.
+with limited_memory(20_000_000), pytest.raises(MemoryError):
     read_table(folder, "long.csv")
+
 files.MOST_MEMORY = 10_000_000
 with pytest.raises(SubmissionError, match=r"^long\.csv:.*\b0\.01\b"):
     read_table(folder, "long.csv")
