@@ -237,7 +237,8 @@ def _load(folder: Path) -> "Submission":
 
 
 def _unreadable(analysis: "Analysis") -> list[str]:
-    return [f"cartlab: {name}: {reason}" for name, reason in analysis.unreadable.items()]
+    reasons = [f"- {name}: {reason}" for name, reason in analysis.unreadable.items()]
+    return ["Not read.", *reasons] if reasons else []
 
 
 def _comparison(

@@ -49,7 +49,7 @@ from pipeline.results import (
 )
 from pipeline.setup import Setup
 from pipeline.submission.models import is_named
-from pipeline.words.numbers import join_names, listing, with_error
+from pipeline.words.numbers import first_few, join_names, listing, with_error
 
 # Relative difference of a mass or spring that matters, and of a frequency, its square root.
 _DIFFERENT, _DETUNED = 0.05, 0.025
@@ -528,20 +528,30 @@ def _places(record: Record) -> tuple[str, ...]:
     return tuple(filter(None, (day and day.group(0).strip("-_. "), folder)))
 
 
-def leave_out_line(groups: Sequence[RecordingGroup]) -> str:
-    """Return the line of submission.toml with which the recordings of one group are used alone.
+def leave_out_lines(groups: Sequence[RecordingGroup]) -> dict[int, str]:
+    """Return, by a group's number, the line of submission.toml that uses its recordings alone.
 
-    It is the largest group that nothing but its carts sets apart.
+    The largest group comes first. Recordings that belong to no group get no line.
     """
-    kept = next((group for group in groups if not group.remark), groups[0])
     known = [name for group in groups for name in group.experiments]
-    names: list[str] = []
-    for group in groups:
-        pattern = f"*{group.label}*"
-        is_exact = {name for name in known if is_named(name, pattern)} == {*group.experiments}
-        if group is not kept:
-            names += [pattern] if group.label and is_exact else group.experiments
-    return f"leave_out = {json.dumps(names, ensure_ascii=False)}"
+    others = say("group_others")
+    numbered = [(i, group) for i, group in enumerate(groups, start=1) if group.remark != others]
+    numbered.sort(key=lambda one: len(one[1].experiments), reverse=True)
+    lines = {}
+    for number, kept in numbered:
+        names: list[str] = []
+        for group in groups:
+            pattern = f"*{group.label}*"
+            is_exact = {name for name in known if is_named(name, pattern)} == {*group.experiments}
+            if group is not kept:
+                names += [pattern] if group.label and is_exact else group.experiments
+        lines[number] = f"leave_out = {json.dumps(names, ensure_ascii=False)}"
+    return lines
+
+
+def group_name(group: RecordingGroup) -> str:
+    """Return the day or folder of a group, else its first recording and how many more it has."""
+    return group.label or first_few(group.experiments, 1)
 
 
 def check_groups(groups: Sequence[RecordingGroup]) -> list[Check]:
@@ -555,6 +565,7 @@ def check_groups(groups: Sequence[RecordingGroup]) -> list[Check]:
         named = f"{group.label}: {names}" if group.label else names
         about = "; ".join(filter(None, [listing(values), group.remark]))
         told.append(f"({number}) {named}: {about}")
-    details = {"groups": ". ".join(told), "line": leave_out_line(groups)}
+    lines = [f"to keep ({number}), {line}" for number, line in leave_out_lines(groups).items()]
+    details = {"groups": ". ".join(told), "lines": "; ".join(lines)}
     finding = Finding(code="groups", kind="groups", details=details, value=len(groups), limit=1)
     return [finding.check]

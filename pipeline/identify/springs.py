@@ -15,6 +15,7 @@ from pipeline.errors import DataError, SubmissionError
 from pipeline.estimation.bode_fit import fit_bode
 from pipeline.estimation.estimates import SIGMA_LIMIT
 from pipeline.estimation.static_gain import fit_static_gain
+from pipeline.identify.groups import find_setups, steps_disagree
 from pipeline.identify.model_checks import NEGLIGIBLE, check_vanishing
 from pipeline.ingest.fill import (
     UNSURE,
@@ -114,7 +115,15 @@ def find_springs(submission: Submission) -> Springs:
         records = read_data(submission.model_copy(update={"experiments": steps})).records
     except SubmissionError:  # no file exists, or no file can be read
         records = ()
-    return decide_springs(records, n=submission.system.carts)
+    n = submission.system.carts
+    found = decide_springs(records, n=n)
+    driven = [record for record in records if len(record.free) == len(record.carts) == n]
+    if n > 1 and found.is_certain and steps_disagree(driven):
+        groups = find_setups(driven, bench=replace(submission.system.bench, springs=found.present))
+        if groups:
+            why = f"{found.why}, but steps of {len(groups)} set-ups contradict each other"
+            return replace(found, why=why, open=(1, n + 1))
+    return found
 
 
 def _state_springs(submission: Submission) -> None:

@@ -11,7 +11,7 @@ from pipeline.identify.findings import say
 from pipeline.identify.groups import (
     check_groups,
     find_setups,
-    leave_out_line,
+    leave_out_lines,
     name_groups,
     steps_disagree,
 )
@@ -59,8 +59,11 @@ def assert_days_apart(records: Sequence[Record], bench: Setup) -> None:
     for group in groups:
         assert set(group.experiments) == {r.id for r in records if group.label in r.id}
     assert [(check.code, check.outcome) for check in check_groups(groups)] == [("groups", "fail")]
-    stated = parse_toml(leave_out_line(groups), where="", error=SubmissionError)
-    assert list(stated["leave_out"]) == [f"*{groups[1].label}*"]
+    left_out = {
+        number: parse_toml(line, where="", error=SubmissionError)["leave_out"]
+        for number, line in leave_out_lines(groups).items()
+    }
+    assert left_out == {1: (f"*{groups[1].label}*",), 2: (f"*{groups[0].label}*",)}
 
 
 def scaled(chain: Chain, factor: float) -> Chain:
@@ -128,5 +131,20 @@ def test_a_day_that_is_part_of_another_is_no_pattern():
         RecordingGroup(experiments=("17-Feb-a", "17-Feb-b"), values={}, std={}, label="17-Feb"),
         RecordingGroup(experiments=("7-Feb-a",), values={}, std={}, label="7-Feb"),
     ]
-    assert leave_out_line(groups) == 'leave_out = ["7-Feb-a"]'
-    assert leave_out_line(groups[::-1]) == 'leave_out = ["*17-Feb*"]'
+    lines = {1: 'leave_out = ["7-Feb-a"]', 2: 'leave_out = ["*17-Feb*"]'}
+    assert leave_out_lines(groups) == lines
+
+
+def test_each_group_can_be_kept_the_largest_first():
+    """There is a line for each group, remark or not, but none for recordings of no group."""
+    groups = [
+        RecordingGroup(experiments=names, values={}, std={}, remark=remark)
+        for names, remark in (
+            (("a", "b"), ""),
+            (("c", "d", "e"), say("group_at_input")),
+            (("f", "g", "h", "i"), say("group_others")),
+        )
+    ]
+    lines = leave_out_lines(groups)
+    assert [*lines] == [2, 1]
+    assert lines[2] == 'leave_out = ["a", "b", "f", "g", "h", "i"]'

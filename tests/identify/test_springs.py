@@ -131,6 +131,21 @@ def test_fill_prints_a_doubt_about_an_existing_unit(unit, said, tmp_path):
     assert "unsure" not in (folder / "submission.toml").read_text(encoding="utf-8").split("[[")[0]
 
 
+@pytest.mark.parametrize("factors", [(1, 1, 1, 1), (1, 1, 2, 2)])
+def test_fill_is_not_sure_of_springs_if_steps_contradict_each_other(factors, tmp_path):
+    """Equal static gains decide nothing if the steps come from several set-ups."""
+    (tmp_path / "data").mkdir()
+    for i, factor in enumerate(factors):
+        record = step([SPRING, SPRING, 0], seconds=8.0 + i)
+        y = np.round(record.y / factor / STEP) * STEP
+        rows = np.column_stack([record.t, record.u, *y])
+        file = tmp_path / "data" / f"step-{i}.csv"
+        np.savetxt(file, rows, delimiter=",", header="time,input,x1 [cm],x2 [cm]", comments="")
+    doubts = fill_folder(tmp_path).doubts
+    assert [doubt.partition(":")[0] for doubt in doubts] == ["springs"] * (len({*factors}) > 1)
+    assert load_submission(tmp_path).system.springs == (True, True, False)
+
+
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="no real recordings here")
 def test_the_real_rig_has_no_far_spring(tmp_path):
     """From the real rig's files, `fill` finds that it has no far spring, without any doubt."""

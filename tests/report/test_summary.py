@@ -6,13 +6,14 @@ from itertools import product
 
 import pytest
 
+from pipeline.identify.groups import check_groups
 from pipeline.report.builder import Page
 from pipeline.report.document import Details, Table, flat, plain_lines
 from pipeline.report.sections.housekeeping import check_blocks
 from pipeline.report.sections.parameters import parameter_blocks, parameter_table
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
-from pipeline.results import Analysis, Check
+from pipeline.results import Analysis, Check, RecordingGroup
 from pipeline.submission import load_submission
 from pipeline.words.text import plain
 from pipeline.workflow import analyse
@@ -128,6 +129,25 @@ def test_a_failed_check_of_unknown_kind_is_named():
     first, second, *_ = next_part(analysis)
     assert odd.message in first
     assert [line.rpartition(" ")[2] for line in (first, second)] == [odd.id, off.id]
+
+
+def test_groups_of_other_carts_get_one_advice():
+    """Repeats of different carts differ, so they need no advice beside that on the groups."""
+    groups = tuple(
+        RecordingGroup(experiments=names, values={}, std={}, label=label)
+        for names, label in ((("a", "b", "c"), ""), (("d", "e"), "7 Feb"))
+    )
+    (odd,) = check_groups(groups)
+    repeats = Check(
+        kind="repeats", parameter="K", outcome="fail", value=99.0, limit=4.0, message="They differ."
+    )
+    plain = replace(make_analysis(1, repeats=1), skipped=(), groups=groups)
+    analysis = replace(plain, checks=(repeats, odd))
+    assert len(next_part(analysis)) == len(next_part(replace(plain, checks=(odd,))))
+    assert every_failed_check_is_named(analysis)
+    assert repeats.message not in terminal_summary(analysis)
+    found, _, _ = terminal_summary(analysis).partition("What to do next.")
+    assert all(name in found for name in ("(1) a", "(2) 7 Feb"))
 
 
 def test_after_wrong_springs_the_report_is_made_again_before_recording():

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
+from pipeline.identify.groups import group_name
 from pipeline.names import MODES, read_name
 from pipeline.report.builder import Page
 from pipeline.report.document import (
@@ -131,6 +132,7 @@ def _findings(analysis: Analysis) -> list[_Finding]:
     """Return what was found, in the order of the report; all that makes numbers wrong first."""
     found = (
         _set_up_in_doubt,
+        _groups,
         _assumed,
         _agreement,
         _undecided,
@@ -296,6 +298,14 @@ def _assumed(analysis: Analysis) -> _Finding | None:
         return None
     items = [clean(f"{f'{one.key} {one.about}'.strip()} ({taken_text(one)})") for one in taken]
     return _Finding(False, _WORDS.spans("assumed", taken=listing(items)))
+
+
+def _groups(analysis: Analysis) -> _Finding | None:
+    """Return the names of the groups of recordings that contradict each other, as one finding."""
+    if not analysis.groups:
+        return None
+    names = [f"({i}) {group_name(group)}" for i, group in enumerate(analysis.groups, start=1)]
+    return _Finding(False, _WORDS.spans("groups", groups=clean("; ".join(names))))
 
 
 def _agreement(analysis: Analysis) -> _Finding | None:
@@ -478,9 +488,12 @@ def _failed(analysis: Analysis) -> Iterator[Spans]:
     groups: dict[str, list[Check]] = {}
     for check in analysis.failed_checks:
         groups.setdefault(_group(check), []).append(check)
+    if "groups" in groups:  # recordings of different carts give different numbers
+        groups["groups"] += groups.pop("repeats", [])
     for group in sorted(groups, key=_place):
         checks = sorted(groups[group], key=lambda check: check.excess, reverse=True)
         shown = checks[: 1 if group in _ALIKE else _MOST_TOLD]
+        shown = [check for check in shown if check.kind == group] if group == "groups" else shown
         shown = () if group in _TOLD_ELSEWHERE else shown
         messages = dict.fromkeys(_sentence(clean(check.message)) for check in shown)
         yield _WORDS.spans(
