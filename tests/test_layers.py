@@ -36,7 +36,7 @@ OTHERS = {
     "bench": (),
     "simulated": (),
     "report": ("simulated", "grading"),
-    "grading": ("report", "grading"),
+    "grading": ("report", "simulated", "grading"),
 }
 HOMES = {
     "matplotlib": ("report",),

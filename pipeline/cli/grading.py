@@ -56,6 +56,10 @@ def grade(
         Path | None,
         typer.Option(metavar="CSV", help="Table of late submissions; see docs/batch.md."),
     ] = None,
+    key: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The answer key of `simulate --vary`: true values."),
+    ] = None,
 ) -> None:
     """Grade a class: gradebook, grades.csv, class page, feedback for each student."""
     from pipeline.grading.batch.grade_class import Options, grade_class
@@ -69,6 +73,7 @@ def grade(
         anonymous=anonymous,
         gradebook=gradebook,
         lateness=lateness,
+        key=str(key.resolve()) if key else "",
     )
     kept = f"stopped; finished grades are kept in {out}; repeat the command to continue"
     with ctrl_c_says(lambda: say(kept)) as check_stop, _batch_progress() as show:

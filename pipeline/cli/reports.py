@@ -431,7 +431,7 @@ def simulate(
     new_folder(out)
     bench = prepare_bench(preset=preset, model=model, hide=hide or ())
     if vary is not None and secret is not None:
-        _simulate_team(out, bench, percent=vary, secret=secret, seed=seed, reported=reported)
+        simulate_team(out, bench, percent=vary, secret=secret, seed=seed, reported=reported)
         return
     for sentence in bench.effect_sentences:
         say(f"hidden: {sentence}")
@@ -441,12 +441,15 @@ def simulate(
     say(f"wrote {out}: try `cartlab report {out}`")
 
 
-def _simulate_team(
+def simulate_team(
     out: Path, bench: "SimulatedBench", *, percent: float, secret: Path, seed: int, reported: bool
 ) -> None:
     """Write the submission of a team, whose bench only the answer key knows."""
+    from pipeline.grading.reference import recompute
     from pipeline.simulated.answer_key import changing_key, draw_bench
     from pipeline.simulated.submission import Students, write_submission
+    from pipeline.submission import load_submission
+    from pipeline.workflow import analyse
 
     team = out.resolve().name
     if secret.resolve().is_relative_to(out.resolve()):
@@ -459,6 +462,9 @@ def _simulate_team(
         noise = int(rng.integers(2**63))
         students = Students(title="Identification of carts on springs", is_anonymous=True)
         write_submission(out, own, seed=noise, reported=reported, students=students)
+        analysis = analyse(load_submission(out), design=False, progress=progress)
+        found = {name: one.value for name, one in recompute(analysis).final.items()}
+        key.teams[team] = replace(answers, found=found)
     say(f"wrote {out}, and its true values to {secret}")
 
 

@@ -31,6 +31,7 @@ class HandIn:
     key : hash of everything that affects the outcome; see `Grading`.
     digest : expected hash of the submitted files; "" to skip this check.
     repairs : see `intake.repairs.read_repairs`.
+    bench : the team's bench in an answer key, as JSON; or "".
     """
 
     id: str
@@ -42,6 +43,7 @@ class HandIn:
     parent: str = ""
     key: str = ""
     digest: str = ""
+    bench: str = field(default="", repr=False)
     repairs: Mapping[str, Mapping[str, str]] = field(default_factory=dict, hash=False)
 
     def plain(self) -> dict[str, Any]:

@@ -24,6 +24,8 @@ BEYOND_BELIEF, BEYOND_BELIEF_DAMPING = 2.5, 20.0
 FITTED_TO_NOTHING = 10.0  # factor: widens the bounds of a final gain on a nonlinear bench
 SAME_STEP = 0.2  # relative difference at which two steps count as the same size
 BY_SIZE = 1.1  # factor: if gains for two step sizes differ by more, each size has its own gain
+# Factor: recordings whose numbers differ more from those of the team's bench are of another bench.
+OTHER_BENCH, OTHER_BENCH_WITH_EFFECTS = 1.03, 1.1
 READ_BY_EYE = 1.1  # factor: error of a resonance or null that is read off the dwells
 
 # ------------------------------------------------------ errors that are worth a remark, in percent

@@ -21,6 +21,7 @@ from pipeline.lock import lock_when_free
 from pipeline.output import write_file
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain, EffectTerm
+from pipeline.setup import Units
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.submission.toml import read_text
 
@@ -36,10 +37,13 @@ class TeamBench:
     ----------
     model : its carts, springs and effects, in the form of a `gap.json`.
     parameters : the true values of the report's parameters.
+    found : the values that an analysis of the team's recordings gives.
     """
 
     model: AugmentedChain = written()
     parameters: dict[str, float] = written("true values of the report's parameters")
+    units: Units = written()
+    found: dict[str, float] = written("values from the team's recordings", default_factory=dict)
 
 
 @result(eq=False)
@@ -63,7 +67,7 @@ class AnswerKey:
         ConfigError : the key has another bench for this team.
         """
         known = self.teams.setdefault(team, bench)
-        if json_text(known) != json_text(bench):
+        if json_text(known.model) != json_text(bench.model):
             raise ConfigError(
                 f"the answer key has another bench for {team}: give the team's folder another "
                 "name, or use another key"
@@ -134,7 +138,8 @@ def draw_bench(
         parameters = {}
     own = replace(bench, chain=drawn, effects=effects, effect_sentences=(), name="")
     model = AugmentedChain(chain=drawn, terms=effects)
-    return own, TeamBench(model=model, parameters=parameters)
+    units = Units(position=bench.position_unit, input=bench.input_unit)
+    return own, TeamBench(model=model, parameters=parameters, units=units)
 
 
 def _scaled(term: EffectTerm, factor: float) -> EffectTerm:

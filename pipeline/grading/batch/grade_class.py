@@ -24,6 +24,7 @@ from pipeline.grading.publish.pseudonyms import STRANGER, pseudonyms_in
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import find_rubric, load_rubric
 from pipeline.grading.similarity.fingerprints import fingerprint
+from pipeline.grading.true_bench import with_benches
 from pipeline.lock import lock_or_refuse
 from pipeline.output import OWNERS_FOLDER, named_folder, own_folder
 from pipeline.resources import EXAMPLES, RUBRICS
@@ -84,6 +85,7 @@ class Options:
     gradebook : file or database URL of the gradebook; default: `gradebook.sqlite` in the output
         folder.
     lateness : path of a table with the days late of each submission.
+    key : path of an answer key with the bench of each team, or "".
     """
 
     jobs: int = 1
@@ -94,10 +96,11 @@ class Options:
     anonymous: bool = False
     gradebook: str | None = None
     lateness: Path | None = None
+    key: str = ""
 
     def lasting(self) -> dict[str, Any]:
         """Return the options that decide the result, to grade the class again in the same way."""
-        kept = ("time_limit", "memory_limit", "figures", "anonymous")
+        kept = ("time_limit", "memory_limit", "figures", "anonymous", "key")
         return {name: getattr(self, name) for name in kept}
 
     def setup(self, rubric: Rubric, *, scratch: Path) -> Setup:
@@ -160,6 +163,9 @@ def grade_class(
         passed: list[str] = []
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
         hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
+        lacking: Sequence[str] = ()
+        if options.key:
+            hand_ins, lacking = with_benches(hand_ins, Path(options.key))
         with book_of(create=True) as book:
             shown = _pseudonyms(book) if hidden else str
             run = _as_run(paths, rubric_file, options)
@@ -177,6 +183,7 @@ def grade_class(
             late_before = book.days_late()
             changes = book.finish(batch, rubric=now, shown=shown)
             remarks = [
+                *_key_messages(lacking, shown=shown),
                 *_skip_messages(passed, unknown, late_file=options.lateness, hidden=hidden),
                 *_class_messages(batch, book, shown=shown),
                 *_lateness_messages(
@@ -274,6 +281,15 @@ def _skip_messages(
     if unknown and late_file:
         who = count(len(unknown), "name") if hidden else ", ".join(unknown)
         yield f"{late_file.name}: no such submission: {who}"
+
+
+def _key_messages(lacking: Sequence[str], *, shown: Callable[[str], str]) -> Iterator[str]:
+    """Yield a message about submissions that the answer key does not name."""
+    if lacking:
+        yield (
+            "not in the answer key, so judged by their own recordings: "
+            f"{_names(sorted(map(shown, lacking)))}"
+        )
 
 
 def _class_messages(batch: Batch, book: Gradebook, *, shown: Callable[[str], str]) -> Iterator[str]:

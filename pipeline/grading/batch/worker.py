@@ -50,7 +50,11 @@ def grade_hand_in(
             original = original if submission.unread or repaired else ""
             authors = tuple(author.id for author in submission.authors)
             graded = grade_submission(
-                submission, rubric=rubric, name=hand_in.id, days_late=hand_in.days_late
+                submission,
+                rubric=rubric,
+                name=hand_in.id,
+                days_late=hand_in.days_late,
+                bench=hand_in.bench,
             )
             grade = graded.grade
             notes = [*grade.notes, *asked_note(opened)]

@@ -39,6 +39,7 @@ from pipeline.grading.tolerance import (
     points_for,
     points_for_one,
 )
+from pipeline.grading.true_bench import SOURCE
 from pipeline.grading.words import WORDS
 from pipeline.names import parameter_names, read_name
 from pipeline.plant.identities import parameter_orders, recover_from_parameters
@@ -97,7 +98,7 @@ def _data(_: asked.DataQuality, context: GradingContext) -> Verdict:
     share = share_sound(context)
     said = group_messages((run, why.rstrip(".")) for run, why in problems.items())[:_NAMED]
     faults = " ".join(text if text.endswith("?") else f"{text}." for text in said)
-    if not runs:
+    if not runs and not problems:
         faults = "There are no recordings."
     elif share == 1 and problems:
         faults = f"{faults} The other recordings are as many as the lab asks for."
@@ -152,7 +153,7 @@ def _parameters(criterion: asked.Parameters, context: GradingContext) -> Verdict
         deviations.append(_deviation(error, name))
         if points_for_one(criterion, deviations[-1]) < 1:
             wrong.add(name)
-            there = f", but your recordings give {known[name].text}" if name in known else ""
+            there = f", but {_whose(known[name])} {known[name].text}" if name in known else ""
             off.append(f"{name}: you report {table[name].text}{there}")
     left = (
         f" Not judged: {first_few(guessed, _NAMED)}."
@@ -174,6 +175,10 @@ def _parameters(criterion: asked.Parameters, context: GradingContext) -> Verdict
         found={n: float(table[n].value) for n in judged if n in table},
         agrees={n: n not in wrong for n in judged if n in table and n not in unproved},
     )
+
+
+def _whose(reference: Reference) -> str:
+    return "your bench has" if reference.source == SOURCE else "your recordings give"
 
 
 def _deviation(error: Fraction, name: str) -> Deviation:

@@ -35,6 +35,7 @@ from pipeline.grading.reference import (
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.tolerance import rounding
 from pipeline.grading.total import with_total
+from pipeline.grading.true_bench import TrueBench, recordings_of_others
 from pipeline.identify.recording_checks import find_bad_recordings, is_reversed
 from pipeline.ingest.columns import conversion, is_count
 from pipeline.names import read_name
@@ -76,6 +77,7 @@ def grade_submission(
     rubric: Rubric,
     name: str,
     days_late: float = 0.0,
+    bench: str = "",
     progress: Progress = silent,
 ) -> Graded:
     """Analyse the recordings of a submission and grade what it reports.
@@ -83,6 +85,10 @@ def grade_submission(
     The analysis uses the rubric's system. Recordings that cannot be read are flagged. If none can
     be read, or the number of carts differs from the rubric's, the grade has the status `failed` and
     the reason.
+
+    Parameters
+    ----------
+    bench : the team's bench in an answer key; see `HandIn`.
     """
 
     def failed(reason: str) -> Graded:
@@ -101,7 +107,7 @@ def grade_submission(
         lacking = "judged with springs that the recordings need but the rubric lacks"
         notes = (*notes, f"{lacking}: {', '.join(springs)}")
     graded = grade_analysis(
-        judged.submission, analysis, rubric=rubric, name=name, days_late=days_late
+        judged.submission, analysis, rubric=rubric, name=name, days_late=days_late, bench=bench
     )
     more = {"springs": springs, "notes": (*notes, *graded.grade.notes)}
     return replace(graded, grade=graded.grade.model_copy(update=more))
@@ -151,6 +157,7 @@ def grade_analysis(
     rubric: Rubric,
     name: str,
     days_late: float = 0.0,
+    bench: str = "",
 ) -> Graded:
     """Grade a submission against the analysis of its own recordings, without any file access.
 
@@ -158,7 +165,7 @@ def grade_analysis(
     ----------
     submission : submission with the rubric's system, from `under_rubric`.
     """
-    work, flags, signed = prepare_work(submission, analysis, rubric=rubric)
+    work, flags, signed = prepare_work(submission, analysis, rubric=rubric, bench=bench)
     judgements = {one.id: judge_with_undoing(one, work) for one in rubric.criteria}
     criteria = award(rubric.criteria, judgements, flags, rubric=rubric)
     grade = Grade(
@@ -177,7 +184,7 @@ def grade_analysis(
 
 
 def prepare_work(
-    submission: Submission, analysis: Analysis, *, rubric: Rubric
+    submission: Submission, analysis: Analysis, *, rubric: Rubric, bench: str = ""
 ) -> tuple[GradingContext, tuple[Flag, ...], tuple[str, ...]]:
     """Return the input to the checks, all flags in the order of `CODES`, and notes.
 
@@ -186,7 +193,7 @@ def prepare_work(
     """
     reported, signed = accept_reversed_signs(submission.reported or Reported(), analysis.records)
     submission = submission.model_copy(update={"reported": reported})
-    work, flags_so_far = _prepare(submission, analysis, rubric=rubric)
+    work, flags_so_far = _prepare(submission, analysis, rubric=rubric, bench=bench)
     more, meant = _flags(work)
     flags = sorted([*flags_so_far, *more], key=lambda flag: CODES.index(flag.code))
     units = (c.message for c in analysis.checks if c.kind in ("position_unit", "input_unit"))
@@ -194,7 +201,7 @@ def prepare_work(
 
 
 def _prepare(
-    submission: Submission, analysis: Analysis, *, rubric: Rubric
+    submission: Submission, analysis: Analysis, *, rubric: Rubric, bench: str
 ) -> tuple[GradingContext, tuple[Flag, ...]]:
     """Return the input to the checks, and the flags of the parameter tables."""
     reported, n = submission.reported or Reported(), rubric.system.carts
@@ -205,6 +212,15 @@ def _prepare(
         per_count=submission.system.position.per_count,
     )
     references = in_doubt(measured, analysis=analysis)
+    bad, is_own = find_bad_recordings(analysis), True
+    if bench:
+        true = TrueBench.read(bench, submission.system)
+        is_own = true.shows_in(measured)
+        references = true.references(references, is_own=is_own)
+        chain = true.chain if true.is_linear or not is_own else chain
+        if not is_own:  # then they count as not handed in
+            bad = recordings_of_others(analysis)
+            submission = submission.model_copy(update={"experiments": ()})
     diagnosis = diagnose_tables(
         reported,
         references=references,
@@ -217,6 +233,8 @@ def _prepare(
         tables.append(diagnosis.corrected)
     if chain is None and not diagnosis.possible:
         tables = []  # the typed table is impossible, but the student's model may be right
+    if not is_own:
+        tables = []  # what follows from numbers of another bench is wrong for this one
     digits = {n: float(rounding(typed) / abs(Fraction(typed))) for n, typed in positive.items()}
     models = state_models(tables, rounding=digits, known=references.final, chain=chain, n=n)
     usual, space = tuple(range(2 * n)), reported.state_space
@@ -235,7 +253,7 @@ def _prepare(
         references=references,
         controller=controller,
         state_models=models,
-        bad=find_bad_recordings(analysis),
+        bad=bad,
         named=diagnosis.named,
         slipped=diagnosis.slipped,
         order=order,

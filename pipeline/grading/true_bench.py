@@ -1,0 +1,111 @@
+"""Judge a team by the true values of its own bench, which an answer key holds.
+
+A number that somebody copies from another team is then wrong, whatever the recordings show.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from pipeline.grading import limits
+from pipeline.grading.gradings import HandIn
+from pipeline.grading.reference import Reference, References
+from pipeline.ingest.columns import conversion
+from pipeline.json_files import json_text
+from pipeline.names import read_name
+from pipeline.plant.chain import Chain
+from pipeline.results import Analysis, Finding
+from pipeline.simulated.answer_key import TeamBench, read_key
+from pipeline.submission import System
+
+SOURCE = "answer_key"  # the source of a reference that is a true value
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrueBench:
+    """The bench of a team, in the units of its submission.
+
+    Attributes
+    ----------
+    found : the values that an analysis of the recordings of this bench gives.
+    is_linear : whether the bench has no hidden effect.
+    """
+
+    chain: Chain
+    parameters: Mapping[str, float]
+    found: Mapping[str, float]
+    is_linear: bool
+
+    @classmethod
+    def read(cls, text: str, system: System) -> "TrueBench":
+        """Return the bench that `with_benches` turned into text."""
+        bench = TypeAdapter(TeamBench).validate_json(text)
+        length = conversion(bench.units.position, system.position.unit) or 1.0
+        gain = length / (conversion(bench.units.input, system.input.unit) or 1.0)
+        chain = bench.model.chain
+
+        def scaled(values: Mapping[str, float]) -> dict[str, float]:
+            return {n: v * gain if read_name(n).is_gain else v for n, v in values.items()}
+
+        return cls(
+            chain=Chain(m=chain.m / gain, c=chain.c / gain, k=chain.k / gain),
+            parameters=scaled(bench.parameters),
+            found=scaled(bench.found),
+            is_linear=not bench.model.terms,
+        )
+
+    def shows_in(self, measured: References) -> bool:
+        """Return whether recordings are of this bench: half of their numbers agree with it."""
+        expected = {**self.parameters, **self.found}
+        apart = [
+            abs(np.log(one.value / expected[name]))
+            for name, one in measured.final.items()
+            if name in expected and not read_name(name).is_damping and one.value > 0
+        ]
+        limit = limits.OTHER_BENCH if self.is_linear else limits.OTHER_BENCH_WITH_EFFECTS
+        return not apart or bool(np.median(apart) <= np.log(limit))
+
+    def references(self, references: References, *, is_own: bool) -> References:
+        """Return references at the true values.
+
+        Their bounds include what recordings of this bench show, so that honest readings are right.
+        """
+
+        def true(name: str, one: Reference) -> Reference:
+            value = self.parameters.get(name)
+            if value is None:
+                return one
+            if is_own:
+                return replace(one.including(value), value=value, source=SOURCE)
+            return Reference.at(value, source=SOURCE).including(self.found.get(name, value))
+
+        def table(of: Mapping[str, Reference]) -> dict[str, Reference]:
+            return {name: true(name, one) for name, one in of.items()}
+
+        return References(initial=table(references.initial), final=table(references.final))
+
+
+def recordings_of_others(analysis: Analysis) -> dict[str, Finding]:
+    """Return the finding of each recording if the recordings are not of the team's bench."""
+    ids = [record.id for record in analysis.records]
+    return {id_: Finding(code="other_bench", run=id_, excludes="wrong") for id_ in ids}
+
+
+def with_benches(hand_ins: Sequence[HandIn], key: Path) -> tuple[list[HandIn], tuple[str, ...]]:
+    """Return the hand-ins with their benches, and the names of those that the key lacks.
+
+    Raises
+    ------
+    ConfigError : the file is not an answer key.
+    """
+    teams = {name.casefold(): json_text(one) for name, one in read_key(key).teams.items()}
+
+    def named() -> Iterator[HandIn]:
+        for one in hand_ins:
+            yield replace(one, bench=teams.get(one.id.casefold(), ""))
+
+    found = list(named())
+    return found, tuple(one.id for one in found if not one.bench)
