@@ -12,7 +12,10 @@ from pipeline.words.phrases import phrases
 from tests.helpers.places import ROOT
 
 RESULTS = ROOT / "pipeline" / "results.py"
-IDENTIFY = sorted((ROOT / "pipeline" / "identify").glob("*.py"))
+WRITERS = [
+    *sorted((ROOT / "pipeline" / "identify").glob("*.py")),
+    ROOT / "pipeline" / "grading" / "true_bench.py",
+]
 
 
 def keys_in(path: Path) -> Iterator[tuple[str, str]]:
@@ -42,7 +45,7 @@ def keys_in(path: Path) -> Iterator[tuple[str, str]]:
 
 def test_every_code_has_a_sentence_and_every_sentence_a_code():
     """Codes and parts are keys of their tables; no sentence of a finding is without its code."""
-    found = {key for path in (*IDENTIFY, RESULTS) for key in keys_in(path)}
+    found = {key for path in (*WRITERS, RESULTS) for key in keys_in(path)}
     for table, fewest in (("findings", 40), ("parts", 15)):
         sentences = phrases("findings", table).by_key
         # Entries of `Analysis.findings` without a sentence here.

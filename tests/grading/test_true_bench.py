@@ -1,0 +1,135 @@
+"""With an answer key, a team is judged by the true values of its own bench."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks import answer_key as copying
+from pipeline.grading.gradings import HandIn
+from pipeline.grading.judge.run import Graded, grade_submission
+from pipeline.grading.reference import Reference, References, recompute
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.true_bench import SOURCE, TrueBench, with_benches
+from pipeline.json_files import json_text
+from pipeline.resources import RUBRICS
+from pipeline.simulated.answer_key import AnswerKey, TeamBench, draw_bench
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.simulated.submission import write_submission
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.helpers.commandline import cartlab_here
+
+RUBRIC = load_rubric(RUBRICS / "throne-1dof.toml")
+
+
+def draw(seed: int, *hide: str):
+    bench = prepare_bench(preset="throne-1dof", hide=hide)
+    return draw_bench(bench, percent=20, rng=np.random.default_rng(seed))
+
+
+def measured(values: dict[str, float]) -> References:
+    of = {name: Reference.at(value, source="bode_fit") for name, value in values.items()}
+    return References(initial=of, final=of)
+
+
+@pytest.fixture(scope="module")
+def friction(tmp_path_factory):
+    """A submission from a bench with dry friction, and the bench as its answer key has it."""
+    folder = tmp_path_factory.mktemp("friction")
+    own, answers = draw(1, "coulomb_friction:cart=1,force=0.003")
+    write_submission(folder, own, seed=3, reported=True, compact=True)
+    submission = load_submission(folder)
+    found = {n: r.value for n, r in recompute(analyse(submission, design=False)).final.items()}
+    return submission, replace(answers, found=found)
+
+
+def grade(submission, bench: TeamBench | None) -> Graded:
+    text = json_text(bench) if bench else ""
+    return grade_submission(submission, rubric=RUBRIC, name="a", bench=text)
+
+
+def test_an_honest_team_keeps_its_points(friction):
+    """With friction too, true values cost an honest team nothing."""
+    submission, bench = friction
+    without, with_key = grade(submission, None).grade, grade(submission, bench).grade
+    assert with_key.points >= without.points
+    assert set(with_key.codes) <= set(without.codes)
+    final = next(one for one in with_key.criteria if "K" in one.expected and "final" in one.id)
+    assert final.expected["K"] == pytest.approx(bench.parameters["K"])
+
+
+def test_recordings_of_another_bench_do_not_count(friction):
+    """Recordings and numbers of a neighbour count as not handed in, and are wrong."""
+    submission, own = friction
+    neighbour = draw(2)[1]
+    judged = grade(submission, neighbour).grade
+    assert {"data_problem", "missing"} <= set(judged.codes)
+    outcomes = {one.id: one.outcome for one in judged.criteria}
+    assert outcomes["data"] == outcomes["dwells"] == outcomes["hardware"] == "fail"
+    assert judged.points < 0.6 * grade(submission, own).grade.points
+
+
+def test_true_values_are_in_the_units_of_the_submission():
+    """Gains, masses and springs follow the submission's own units; frequencies stay."""
+    _, answers = draw(1)
+    text = json_text(answers)
+    usual = TrueBench.read(text, RUBRIC.system)
+    position = RUBRIC.system.position.model_copy(update={"unit": "mm"})
+    other = TrueBench.read(text, RUBRIC.system.model_copy(update={"position": position}))
+    assert other.parameters["K"] == pytest.approx(10 * usual.parameters["K"])
+    assert other.parameters["omega_n"] == usual.parameters["omega_n"]
+    assert other.chain.parameters() == pytest.approx(dict(other.parameters))
+
+
+def test_bounds_are_those_of_the_own_bench():
+    """Own recordings widen the bounds around the true value; those of others do not."""
+    _, answers = draw(1)
+    true = TrueBench.read(json_text(answers), RUBRIC.system)
+    K, omega = true.parameters["K"], true.parameters["omega_n"]
+    own = measured({"K": 1.01 * K, "omega_n": 0.99 * omega})
+    others = measured({"K": 1.2 * K, "omega_n": 1.1 * omega})
+    assert true.shows_in(own)
+    assert not true.shows_in(others)
+    judged = true.references(own, is_own=True).final["K"]
+    assert (judged.value, judged.high, judged.source) == (K, 1.01 * K, SOURCE)
+    judged = true.references(others, is_own=False).final["K"]
+    assert (judged.low, judged.high) == (K, K)
+
+
+def test_a_bench_belongs_to_the_name_of_a_submission(tmp_path):
+    """Case does not matter. A team that the key lacks is judged by its recordings."""
+    key = AnswerKey(secret="0", teams={"Team-1": draw(1)[1]})
+    (tmp_path / "key.json").write_text(json_text(key), "utf-8")
+    found, lacking = with_benches([HandIn(id="team-1"), HandIn(id="x")], tmp_path / "key.json")
+    assert [bool(one.bench) for one in found] == [True, False]
+    assert lacking == ("x",)
+
+
+def test_the_command_judges_by_the_key_and_names_who_is_missing(tmp_path):
+    """`simulate` writes the key, `grade --key` uses it, and a later grading knows its path."""
+    key, school = tmp_path / "key.json", tmp_path / "class"
+    made = cartlab_here(
+        "simulate", "--preset", "throne-1dof", "--vary", "20", "--secret", str(key),
+        "--out", str(school / "a"), "--reported",
+    )  # fmt: skip
+    assert made.returncode == 0
+    assert json.loads(key.read_text("utf-8"))["teams"]["a"]["found"]["omega_n"] > 0
+    (school / "a").rename(school / "b")
+    out = tmp_path / "grades"
+    command = ("grade", str(school), "--rubric", "throne-1dof", "--out", str(out), "--no-figures")
+    done = cartlab_here(*command, "--key", str(key))
+    assert done.returncode == 0
+    assert "answer key" in done.stderr
+    assert json.loads((out / "run.json").read_text("utf-8"))["options"]["key"] == str(key)
+    assert cartlab_here(*command, "--key", str(out / "class.html")).returncode == 2
+
+
+@pytest.mark.slow
+def test_copiers_lose_points_and_honest_teams_do_not(tmp_path):
+    """Twelve teams in one run; the benchmark does the same with 120."""
+    kinds = copying.summarise(list(copying.points_of_class(tmp_path, teams=12)))
+    assert kinds["honest"].min() >= 19.5
+    assert kinds["numbers copied"][:, 1].max() <= 17
+    assert kinds["all copied"].max() <= 10
