@@ -3,7 +3,7 @@ const charts = (() => {
   'use strict';
   const SVG = 'http://www.w3.org/2000/svg';
   const make = (name, attributes = {}, ...children) => {
-    const drawn = ['svg', 'line', 'circle'].includes(name);
+    const drawn = ['svg', 'line', 'circle', 'path', 'rect', 'text', 'g'].includes(name);
     const node = drawn ? document.createElementNS(SVG, name) : document.createElement(name);
     for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
     node.append(...children);

@@ -11,7 +11,7 @@
   };
   const short = (value) => (value === undefined ? '–' : value.toPrecision(3).replace('-', '−'));
 
-  let state = { phase: 'waiting', waits: 'Waiting for the bench to answer.', turn: 0, offered: [], plan: [], remarks: [], units: {}, thought: { number: 0, text: '' }, carts: 0, seconds: 0, seconds_left: 0 };
+  let state = { phase: 'waiting', waits: 'Waiting for the bench to answer.', turn: 0, offered: [], plan: [], remarks: [], units: {}, springs: [], free: [], thought: { number: 0, text: '' }, carts: 0, seconds: 0, seconds_left: 0 };
   let since = performance.now(); // when the phase began
   let run = 0;
   let points = []; // [t, input, target, x1, …] of this run
@@ -27,7 +27,7 @@
     if (fresh.phase !== state.phase || fresh.now !== state.now) since = performance.now();
     const asked = fresh.instruction?.number !== state.instruction?.number;
     const relisted = JSON.stringify(fresh.plan) !== JSON.stringify(state.plan);
-    const redrawn = ['carts', 'closed', 'units'].some((name) => JSON.stringify(fresh[name]) !== JSON.stringify(state[name]));
+    const redrawn = ['carts', 'closed', 'units', 'springs', 'free'].some((name) => JSON.stringify(fresh[name]) !== JSON.stringify(state[name]));
     state = fresh;
     document.title = `${state.now ?? 'At the bench'} – cartlab`;
     $('title').textContent = state.title || 'cartlab';
@@ -46,7 +46,7 @@
       if (state.instruction) $(again ? 'repeat' : 'confirm').focus({ preventScroll: true });
     }
     if (relisted) listPlan();
-    if (redrawn) makePlots();
+    if (redrawn) { makePlots(); makeBench(); }
     $('told').hidden = state.remarks.length === 0;
     $('remarks').replaceChildren(...state.remarks.map((text) => make('li', {}, text)));
   };
@@ -153,9 +153,54 @@
       plot.setData(columns(lines));
       lines.forEach((line, i) => { told[i].textContent = short(points.at(-1)?.[line.column]); });
     }
+    moveCarts();
     showProgress();
   };
   const redraw = () => { drawn ||= requestAnimationFrame(frame); };
+
+  // ------------------------------------------------------------------ the carts
+
+  const CART = 70, GAP = 110, MOST = 50, AXLE = 58; // px: width, rest distance, largest motion, height of the springs
+  let bench = null; // what moves: the carts, the springs, the arrow of the input
+  let largest = { input: 0, motion: 0 }; // of this run
+  const restOf = (i) => (i < 0 ? 0 : i < state.carts ? GAP + i * (CART + GAP) : GAP + state.carts * (CART + GAP));
+  const coil = (from, to) => {
+    const [ends, turns] = [10, 8], pitch = (to - from - 2 * ends) / turns;
+    const bends = Array.from({ length: turns }, (_, i) => `L${(from + ends + (i + 0.5) * pitch).toFixed(1)} ${AXLE + (i % 2 ? 9 : -9)}`);
+    return `M${from.toFixed(1)} ${AXLE}H${(from + ends).toFixed(1)}${bends.join('')}L${(to - ends).toFixed(1)} ${AXLE}H${to.toFixed(1)}`;
+  };
+  const makeBench = () => {
+    bench = null;
+    if (!state.carts) return $('carts').replaceChildren();
+    const width = restOf(state.carts), wall = (x) => make('line', { class: 'wall', x1: x, x2: x, y1: 20, y2: 90 });
+    const carts = Array.from({ length: state.carts }, (_, i) => make('g', { class: state.free.includes(i + 1) || !state.now ? '' : 'held' },
+      make('rect', { x: 0, y: 34, width: CART, height: 46, rx: 6, stroke: `var(--cart-${i + 1})` }),
+      make('circle', { cx: 16, cy: 84, r: 6 }), make('circle', { cx: CART - 16, cy: 84, r: 6 }),
+      make('text', { x: CART / 2, y: 63 }, state.free.includes(i + 1) || !state.now ? String(i + 1) : `${i + 1} held`)));
+    const springs = state.springs.map((there) => there && make('path', { class: 'spring' }));
+    const force = make('path', { class: 'force' });
+    const walls = [state.springs[0] && wall(0), state.springs.at(-1) && wall(width)].filter(Boolean);
+    const floor = make('line', { class: 'wall', x1: 0, x2: width, y1: 90, y2: 90 });
+    $('carts').replaceChildren(make('svg', { viewBox: `-4 0 ${width + 8} 94` }, floor, ...walls, ...springs.filter(Boolean), ...carts, force));
+    bench = { carts, springs, force };
+    moveCarts();
+  };
+  const moveCarts = () => {
+    if (!bench) return;
+    const [, input = 0, , ...x] = points.at(-1) ?? [];
+    const scale = largest.motion ? MOST / largest.motion : 0;
+    const at = bench.carts.map((_, i) => restOf(i) + scale * (x[i] ?? 0));
+    bench.carts.forEach((cart, i) => cart.setAttribute('transform', `translate(${at[i].toFixed(1)} 0)`));
+    bench.springs.forEach((spring, j) => spring && spring.setAttribute('d', coil(j ? at[j - 1] + CART : 0, at[j] ?? restOf(j))));
+    const [from, long] = [at[0] + CART / 2, largest.input ? 45 * input / largest.input : 0];
+    bench.force.setAttribute('d', Math.abs(long) < 1 ? '' : `M${from} 20h${long}m${-6 * Math.sign(long)} -5l${6 * Math.sign(long)} 5l${-6 * Math.sign(long)} 5`);
+  };
+  const measure = (fresh) => {
+    for (const [, input, , ...x] of fresh) {
+      largest.input = Math.max(largest.input, Math.abs(input));
+      largest.motion = Math.max(largest.motion, ...x.map(Math.abs));
+    }
+  };
 
   // ------------------------------------------------------------------ news
 
@@ -167,7 +212,8 @@
   });
   news.addEventListener('points', (event) => {
     const fresh = JSON.parse(event.data);
-    if (fresh.run !== run) [run, points, rate] = [fresh.run, [], []];
+    if (fresh.run !== run) [run, points, rate, largest] = [fresh.run, [], [], { input: 0, motion: 0 }];
+    measure(fresh.points);
     points.push(...fresh.points);
     while (points.length && points[0][0] < points.at(-1)[0] - WINDOW) points.shift();
     rate.push([performance.now(), fresh.counters.lines]);

@@ -284,6 +284,8 @@ class LiveState(ShownSession):
             return {
                 "title": self._submission.title if self._submission else "",
                 "carts": system.carts if system else 0,
+                "springs": list(system.springs) if system else [],
+                "free": list(self._now.carts) if self._now else [],
                 "units": {
                     "position": _unit(system and system.position),
                     "input": _unit(system and system.input),

@@ -412,6 +412,24 @@ def test_the_page_shows_plan_progress_counters_and_curves(page, show):
     expect(window.locator("#plots .keys").first).to_contain_text("target")
 
 
+def test_the_carts_move_as_they_are_measured(page, show):
+    """The drawing follows the last point, and a held cart says so."""
+    window = show()
+    page.session.started(SINE)
+    page.session.readings(lines(0, 1000), Anomalies())
+    carts, shifts = window.locator("#carts g"), r"translate\((.*) 0\)"
+    expect(carts).to_have_count(2)
+    expect(carts.first).to_have_attribute("transform", re.compile(r"translate\(1[56]"))
+    first, second = (
+        float(re.fullmatch(shifts, carts.nth(i).get_attribute("transform"))[1]) for i in range(2)
+    )
+    assert (first, second) == pytest.approx((110 + 50, 290 - 50), abs=1)  # px: the motion is equal
+    expect(window.locator("#carts .spring")).to_have_count(3)
+    expect(window.locator("#carts .held")).to_have_count(1 if len(SINE.carts) == 1 else 0)
+    page.session.started(DECAY.model_copy(update={"carts": (2,)}))
+    expect(window.locator("#carts .held")).to_have_text("1 held")
+
+
 @pytest.mark.parametrize("how", ["click", "Enter"])
 def test_an_instruction_is_confirmed_with_its_button(page, show, how):
     """An instruction appears with the focus on its button, and disappears once it is confirmed."""
