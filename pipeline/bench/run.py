@@ -394,7 +394,7 @@ class Session:
                 self._zero_at_rest(recording)
                 return ""
         swings = ", ".join(f"cart {cart} moved by {swing} counts" for cart, swing in moving.items())
-        return f"not at rest when the run began: {swings} within half a second"
+        return f"not at rest when the recording began: {swings} within half a second"
 
     def _watch_rest(self, nothing: Order, watch: LineWatch) -> None:
         """Wait for the carts to settle while `watch` checks the lines.
@@ -546,7 +546,7 @@ class Session:
                 if lines:
                     first, unread = lines[0].ms if first is None else first, None
                     if lines[-1].ms - first > end + _NEARLY:
-                        return watch.stop("the bench went on past the end of the run")
+                        return watch.stop("the bench went on past the end of the recording")
                 else:
                     unread = now if unread is None else unread
                     if now - unread > 0.25:  # s; the motor may be on while nothing is checked

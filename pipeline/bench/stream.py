@@ -169,7 +169,7 @@ class Stream:
         if held.ms < last and after.ms < last and after.ms >= held.ms:
             self._resets += 1
             return self._break(
-                "the bench restarted during the run: check its supply and its reset line"
+                "the bench restarted during the recording: check its supply and its reset line"
             )
         if before is not None and _stands_out(before, held, after, closed=self._closed):
             self._reject()

@@ -144,7 +144,9 @@ class MeasuredRun:
         with np.errstate(over="ignore", invalid="ignore"):
             y = simulate_linear(self.chain, record.t, u, x0=x0, free=self.free, hold=record.hold)
         if not np.all(np.isfinite(y)):
-            raise DataError(f"{record.id}: the identified carts cannot be simulated over this run")
+            raise DataError(
+                f"{record.id}: the identified carts cannot be simulated over this recording"
+            )
         return y
 
 
@@ -307,7 +309,7 @@ def _open(run: MeasuredRun) -> _Simulated:
     note = (
         f"the logged input explains the motion only if multiplied by {scale:.3g}, as done here: "
         f"the difference over all carts falls from {100 * as_logged:.0f} % to {100 * scaled:.0f} % "
-        "(the unit or sign of this run's input or positions is not the stated one)"
+        "(the unit or sign of this recording's input or positions is not the stated one)"
     )
     return _Simulated(
         y=unforced + scale * forced,

@@ -70,7 +70,7 @@ class Recording(TomlTable):
     frequency_end : frequency in Hz at which a chirp ends.
     tones : the sines of a multisine. Each has the harmonic of `frequency`, its share of the
         amplitude and its phase in rad.
-    cycles : number of periods. The run takes cycles/frequency seconds.
+    cycles : number of periods. The recording takes cycles/frequency seconds.
     release : the cart that is pulled out and released by hand; None if no cart is released.
     controller : the controller that closes the loop.
     settle : time of rest before the run, in s.
@@ -247,14 +247,14 @@ _HEAD = """\
 #                frequency_end; "multisine" is the sum of its tones. Further waves are "sine",
 #                "triangle", "sawtooth" and "delta", a short pulse.
 # amplitude      {input}; in closed loop {position}. Zero if a hand starts a decay.
-# frequency      Hz, of the wave. The run takes cycles/frequency seconds.
+# frequency      Hz, of the wave. The recording takes cycles/frequency seconds.
 # settle         s of rest beforehand
 """
 _CHECK = """\
-# CHECK these two limits before you switch the motor on. A run that passes one is stopped; then
-# divide its amplitude by four and record it again.
+# CHECK these two limits before you switch the motor on. A recording that passes one is stopped;
+# then divide its amplitude by four and record it again.
 #   input    {input}. The largest input of the motor.
-#   travel   {position}. The largest distance of a cart from its zero; runs aim at 40 % of it.
+#   travel   {position}. The largest distance of a cart from its zero; recordings aim at 40 % of it.
 """
 
 

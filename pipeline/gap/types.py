@@ -98,7 +98,7 @@ class GapWindow:
     start: float = written("s", key="from")
     end: float = written("s", key="to")
     what: str = written()
-    share: float = written("share of the cart's squared error in this run")
+    share: float = written("share of the cart's squared error in this recording")
 
 
 @result()
@@ -194,7 +194,7 @@ class ForceAgainst:
     at: tuple[float, ...] = written("mean of the quantity in each bin")
     force: tuple[float, ...] = written("mean force")
     spread: tuple[float | None, ...] = written(
-        "standard deviation between runs; null if only one run has data in the bin"
+        "standard deviation between recordings; null if only one recording has data in the bin"
     )
     formula: tuple[float, ...] | None = written("mean force by the formula")
 
@@ -351,10 +351,10 @@ class Gap:
         """Relative errors, pooled over the held-out runs."""
         return GapErrors(baseline=self.baseline, final=self.final, noise_floor=self.noise_floor)
 
-    repeatability: float | None = written("relative difference of runs with the same input")
+    repeatability: float | None = written("relative difference of recordings with the same input")
     by_record: tuple[RecordGap, ...] = written()
     free_run: tuple[FreeRun, ...] = written(
-        "error of one simulation over each whole run", default=()
+        "error of one simulation over each whole recording", default=()
     )
     where: tuple[GapWindow, ...] = written("where the linear model fails most")
     left: tuple[GapWindow, ...] = written(
@@ -385,8 +385,8 @@ class Gap:
         """Root mean square difference of the two contenders after refits, in units of the noise."""
         return self.proposal and self.proposal.separation
 
-    training: tuple[str, ...] = written("ids of the runs")
-    held_out: tuple[str, ...] = written("ids of the runs")
+    training: tuple[str, ...] = written("ids of the recordings")
+    held_out: tuple[str, ...] = written("ids of the recordings")
     left_out: tuple[Finding, ...] = written(
         "recordings that the identification did not use; no figure here includes them",
         default=(),
@@ -395,7 +395,7 @@ class Gap:
         "times at which a hand moved a cart, excluded from fits and errors", default=()
     )
     spread: dict[int, float] = written(
-        "relative spread of the dry friction from run to run, by cart",
+        "relative spread of the dry friction from recording to recording, by cart",
         key="friction_spread",
         default_factory=dict,
     )

@@ -70,7 +70,9 @@ class Flag(GradeTable):
     code: Code
     parameters: Annotated[
         tuple[str, ...],
-        Field(description="numbers that the mistake explains, missing items, or runs concerned"),
+        Field(
+            description="numbers that the mistake explains, missing items, or recordings concerned"
+        ),
     ]
     message: str
     evidence: Values

@@ -155,14 +155,14 @@ FORCE_OFFSET = Effect(
             neutral=0.0,
         ),
     ),
-    fingerprint="In every run the cart rests off zero, as if pushed by the same force.",
-    deciding_run="Runs with different carts held: the stiffer the springs on the cart, the less a "
-    "force displaces it. A wrong encoder zero shifts the reading equally in all runs.",
+    fingerprint="In every recording the cart rests off zero, as if pushed by the same force.",
+    deciding_run="Recordings with different carts held: the stiffer the springs on the cart, the "
+    "less a force displaces it. A wrong encoder zero shifts the reading equally in all recordings.",
     shown_by="held carts",
     reference="the balance of forces in the chain at rest",
     axis="position",
     only_rest=True,
-    equivalent="A wrong encoder zero, if the same carts are held in all runs.",
+    equivalent="A wrong encoder zero, if the same carts are held in all recordings.",
 )
 
 

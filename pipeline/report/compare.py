@@ -134,7 +134,7 @@ def _find_worst(runs: Sequence[ComparedRun]) -> tuple[str, int, float] | None:
 
 
 def _tell_result(runs: Sequence[ComparedRun]) -> str:
-    worst, counted = _find_worst(runs), count(len(runs), "run")
+    worst, counted = _find_worst(runs), count(len(runs), "recording")
     if worst is None:
         return _WORDS.text("result_alone", runs=counted)
     run, cart, nrmse = worst

@@ -19,7 +19,7 @@ _WHERE = {
 
 
 def catalogue_text(effects: Sequence[Effect]) -> str:
-    """Return every effect with its place, law, parameters, fingerprint and deciding run."""
+    """Return every effect with its place, law, parameters, fingerprint and deciding recording."""
     return "\n\n".join(_entry(effect) for effect in effects)
 
 

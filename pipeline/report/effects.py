@@ -1,4 +1,4 @@
-"""The catalogue of effects as a page: law, picture and deciding run of each."""
+"""The catalogue of effects as a page: law, picture and deciding recording of each."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

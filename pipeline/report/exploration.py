@@ -95,7 +95,7 @@ def _tone(gap: Gap | None) -> Tone:
 
 
 def _story(page: Page, turns: Sequence[Turn]) -> list[Block]:
-    """Return each turn: time, recordings, decision, and the deciding run if there is one."""
+    """Return each turn: time, recordings, decision, and the deciding recording if there is one."""
     blocks: list[Block] = []
     for number, turn in enumerate(turns, start=1):
         recorded = listing(turn.recorded) or _WORDS.text("nothing_new")

@@ -38,6 +38,7 @@ from pipeline.report.figures.gap import (
 from pipeline.report.figures.style import (
     keep_in_sight,
     legend_above,
+    name_panels,
     panels,
     plot_measured,
     plot_model,
@@ -70,7 +71,6 @@ _MOST_ROWS = 28  # most runs in the overview; gap.json has all runs
 LEGEND = 46  # two names with more characters do not fit above a figure
 _MOST_NAMES = 3  # most effects named in a caption; the text above it names all
 _MORE_TRACES = 3  # traces drawn in addition to the one in the summary
-_MOST_RUNS = 4  # most runs drawn in the lab report
 
 
 def make_gap_files(
@@ -146,7 +146,7 @@ def _where(page: Page, gap: Gap) -> list[Block]:
     alone = "" if gap.effects else "_linear"
     values = {
         "more": more,
-        "runs": count(len(shown), "run"),
+        "runs": count(len(shown), "recording"),
         "run": top.experiment,
         "cart": top.cart,
     }
@@ -472,28 +472,48 @@ def augmented_hardware_blocks(page: Page, gap: Gap) -> list[Block]:
     added = added_name(gap)
     table = page.table(WORDS, "replay_table", rows, "lcdd", added=added, Added=capital(added))
     blocks: list[Block] = [paragraph(WORDS.spans("replay", added=added)), table]
-    drawn = [(run, found) for run, found in replays.items() if found][:_MOST_RUNS]
-    for i, (run, found) in enumerate(drawn, start=1):
-        worst = max(found, key=lambda replay: replay.nrmse)
-        figure = _replay_figure(found, position_unit=page.position, added=added)
-        values = {"run": run, "error": share(worst.nrmse), "cart": worst.check.cart, "added": added}
-        blocks.append(
-            page.picture(f"hardware-effects-{i}", figure, WORDS, "replay_figure", **values)
+    ordered = sorted(filter(None, replays.values()), key=_largest_error, reverse=True)
+    drawn = [ordered[0], *ordered[1:][-1:]]  # the worst and the best
+    worst = max(drawn[0], key=lambda replay: replay.nrmse)
+    values = {
+        "run": worst.check.experiment,
+        "error": share(worst.nrmse),
+        "cart": worst.check.cart,
+        "added": added,
+        "others": WORDS.text(
+            "replay_best", runs=len(ordered), run=drawn[-1][0].check.experiment, added=added
         )
-    return blocks
+        if len(drawn) > 1
+        else "",
+    }
+    figure = _replay_figure(drawn, position_unit=page.position, added=added)
+    return [*blocks, page.picture("hardware-effects", figure, WORDS, "replay_figure", **values)]
 
 
-def _replay_figure(replays: Sequence[Replay], *, position_unit: str, added: str) -> Figure:
-    figure, axes = panels(*[1.05] * len(replays))
-    for ax, replay in zip(axes, replays, strict=True):
-        check = replay.check
-        plot_measured(ax, check.t, check.measured)
-        plot_second(ax, check.t, check.model, label="linear model")
-        plot_model(ax, check.t, replay.model, label=added)
-        keep_in_sight(ax, check.measured)
-        ax.set_ylabel(position_label(check.cart, position_unit))
+def _largest_error(replays: Sequence[Replay]) -> float:
+    return max(replay.nrmse for replay in replays)
+
+
+def _replay_figure(runs: Sequence[Sequence[Replay]], *, position_unit: str, added: str) -> Figure:
+    """Return recordings side by side: each cart with both models."""
+    carts = sorted({replay.check.cart for run in runs for replay in run})
+    several = len(runs) > 1
+    figure, axes = panels(*[1.05] * len(carts), columns=len(runs), share_x="column", titled=several)
+    for column, run in enumerate(runs):
+        own = axes[column :: len(runs)]
+        for replay in run:
+            check, ax = replay.check, own[carts.index(replay.check.cart)]
+            plot_measured(ax, check.t, check.measured)
+            plot_second(ax, check.t, check.model, label="linear model")
+            plot_model(ax, check.t, replay.model, label=added)
+            keep_in_sight(ax, check.measured)
+        own[-1].set_xlabel("time [s]")
+    for ax, cart in zip(axes[:: len(runs)], carts, strict=True):
+        ax.set_ylabel(position_label(cart, position_unit))
+    if several:
+        names = [clean(run[0].check.experiment) for run in runs]
+        name_panels(axes[: len(runs)], names, columns=len(runs))
     legend_above(axes[0])
-    axes[-1].set_xlabel("time [s]")
     return figure
 
 

@@ -159,7 +159,7 @@ KINDS = {
     "garble": "one character of the line becomes one that no line contains",
     "merge": "the line's end is lost, so the next line follows without a break",
     "delay": f"this line and those after it arrive together, {1e3 * HOLD:g} ms late",
-    "reset": "the bench's clock restarts during the run",
+    "reset": "the bench's clock restarts during the recording",
     "disconnect": "the cable is pulled: the connection ends",
     "stuck": "from then on the encoder no longer changes",
 }

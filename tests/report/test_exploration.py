@@ -61,7 +61,7 @@ def test_effects_have_their_usual_names_in_the_diary():
 
 
 def test_the_diary_gives_the_answer_first(tmp_path):
-    """The diary gives parameters and effects first, then each turn with its deciding run."""
+    """The diary gives parameters and effects first, then each turn with its deciding recording."""
     gap = make_gap()
     runs = {trace.experiment for trace in gap.traces}
     turns = [

@@ -55,7 +55,7 @@ def test_a_session_is_watched_and_steered(show, tmp_path, real, monkeypatch):
         assert fits(window)
         window.locator("#told").scroll_into_view_if_needed()
         expect(stop).to_be_in_viewport()  # always in reach
-        window.get_by_role("button", name="Keep this partial run").click()
+        window.get_by_role("button", name="Keep this partial recording").click()
         expect(window.locator("#plan .done b")).to_have_text(["long", "next"])
         expect(status).to_have_text("Recording last.")
         window.reload()

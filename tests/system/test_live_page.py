@@ -460,7 +460,7 @@ def test_only_buttons_that_have_an_effect_are_enabled(page, show):
     page.session.buttons.begin()
     page.session.buttons.offer("skip", "keep", "repeat")
     record(page)
-    window.get_by_role("button", name="Keep this partial run").click()
+    window.get_by_role("button", name="Keep this partial recording").click()
     until(lambda: page.session.buttons.pressed == "keep")
     expect(skip).to_be_disabled()
 

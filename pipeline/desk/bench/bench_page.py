@@ -436,4 +436,4 @@ def _find_partial(submission: Submission, name: str) -> str:
     """Return a note if an earlier run of this recording ended early, else ""."""
     file = f"data/{name}.partial.txt"
     is_there = file_problem(submission.folder, file) is None
-    return f"An earlier run ended early; what it recorded is in {file}." if is_there else ""
+    return f"An earlier try ended early; what it recorded is in {file}." if is_there else ""

@@ -201,7 +201,7 @@ def judge_hardware(criterion: asked.Hardware, context: GradingContext) -> Verdic
     """
     runs = {e.id for e in context.submission.experiments if e.kind == "closed_loop"}
     if not runs:
-        return Verdict(share=NONE, message="No closed-loop run was submitted.")
+        return Verdict(share=NONE, message="No closed-loop recording was submitted.")
     if off_scale(context.analysis) or clock_units(context.analysis) != 1.0:
         return Verdict(share=None, message=f"Not checked: {OFF_SCALE}.")
     closed: dict[str, list[float]] = {}
@@ -223,7 +223,11 @@ def judge_hardware(criterion: asked.Hardware, context: GradingContext) -> Verdic
         share=points_for(criterion, [deviation]),
         models=((deviation,),),
         message=f"{run}: model and measurement differ by {errors[run]:.3g} % of the motion."
-        + (" The gains used in the run are not the reported ones." if _others_ran(context) else ""),
+        + (
+            " The gains used in the recording are not the reported ones."
+            if _others_ran(context)
+            else ""
+        ),
         expected={"nrmse_percent": criterion.full_percent},
         found={"nrmse_percent": errors[run]},
     )

@@ -230,7 +230,7 @@ class Judgement:
 # Kinds of recording that meet a requirement for only some of the carts. A step also counts as a
 # decay, because the carts ring down after it.
 _SERVES = {"decay": ("decay", "step"), "sine": ("sine",), "step": ("step",)}
-_RECORDING = {"sine": "sine dwell", "closed_loop": "closed-loop run", "bode": "Bode table"}
+_RECORDING = {"sine": "sine dwell", "closed_loop": "closed-loop recording", "bode": "Bode table"}
 
 
 def find_pieces(
@@ -308,7 +308,7 @@ def data_flag(problems: Mapping[str, str]) -> Flag:
     """Return the flag for recordings with a problem."""
     first, problem = next(iter(problems.items()))
     others = len(problems) - 1
-    have = "run has" if others == 1 else "runs have"
+    have = "recording has" if others == 1 else "recordings have"
     more = f" ({others} more {have} a problem)" if others else ""
     return Flag(
         code="data_problem",

@@ -41,7 +41,7 @@ _KINDS = {  # names for kinds of recordings
     "step": "step",
     "sine": "sine dwell",
     "sweep": "sweep",
-    "closed_loop": "closed-loop run",
+    "closed_loop": "closed-loop recording",
     "bode": "table of amplitude ratios",
 }
 _MOST_TOLD = 3  # most findings of one kind, or messages of one group of checks
