@@ -33,6 +33,7 @@ from pipeline.plant.augmented import simulate_augmented
 from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.effect import AugmentedChain, effect_name, input_steps
 from pipeline.plant.simulator.generated_forces import shaped_input
+from pipeline.report.builder import Page as ReportPage
 from pipeline.report.document import Document, Formula, paragraph, plain_lines
 from pipeline.report.equations.model import augmented_equations, in_order, law
 from pipeline.report.figures.gap import predicted_figure
@@ -41,6 +42,7 @@ from pipeline.report.gap_files import with_gap
 from pipeline.report.gap_report import (
     LEGEND,
     _telling_first,
+    augmented_hardware_blocks,
     build_gap_document,
     make_gap_files,
 )
@@ -51,6 +53,7 @@ from pipeline.submission import load_submission
 from pipeline.words.math import to_text
 from pipeline.words.text import plain
 from pipeline.workflow import analyse
+from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.effects import make_term
 from tests.helpers.gaps import CHAIN, RESIDUAL, T, U, make_gap, two_cart_analysis, usual_terms
@@ -533,6 +536,27 @@ def test_command_writes_everything_and_names_the_friction(bench):
     force = effect["parameters"]["force"]["value"]
     for name in ("model.c", "model.m"):
         assert f"coulomb_friction_1_force = {force}" in (out / name).read_text(encoding="ascii")
+
+
+def test_many_closed_loops_are_one_figure_and_a_table():
+    """The figure shows the recordings with the largest and the smallest error; the table all."""
+    analysis = make_analysis(2)
+    loop = next(record for record in analysis.records if record.kind == "closed_loop")
+    checks = [replace(check, loop="open") for check in analysis.hardware]
+    names = [f"loop-{i}" for i in range(5)]
+    analysis = replace(
+        analysis,
+        records=tuple(
+            replace(loop, id=name, y=scale * loop.y) for scale, name in enumerate(names, start=1)
+        ),
+        hardware=tuple(replace(check, experiment=name) for name in names for check in checks),
+    )
+    table, picture = augmented_hardware_blocks(
+        ReportPage(analysis), make_gap("named", ("coulomb_friction",))
+    )[1:]
+    assert [plain(row[0].text) for row in table.rows] == [n for n in names for _ in checks]
+    drawn = picture.svg
+    assert [name for name in names if name in Page(drawn).text] == [names[0], names[-1]]
 
 
 @pytest.mark.slow
