@@ -12,6 +12,7 @@ from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.force_balance import between
 from pipeline.estimation.noise import difference_noise, extrema
+from pipeline.gap.pem.kernel import PemRunArrays
 from pipeline.plant.simulate import interpolate_band_limited
 from pipeline.plant.simulator.kernel import Excitation, describe_run
 from pipeline.results import Finding, Intervention, Record
@@ -29,6 +30,7 @@ _HELD_TIME = 2.0
 _HELD_STILL = 0.1  # s; carts that an input moves at once do not rest this long
 _RESTING = 1.5  # encoder steps; largest range of readings of a cart at rest
 _ONE_READING = 0.07  # s; at rest, this time counts as one independent reading
+_LONGEST = 2.5e-3  # s; longest step of the prediction-error fit for a bench of carts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,6 +135,32 @@ class GapRun:
     def thin(self) -> "GapRun":
         """The run as the fits use it: blocks of fast samples are averaged, the pieces are kept."""
         return _thin(self) if self.block > 1 else self
+
+    @cached_property
+    def followed(self) -> PemRunArrays:
+        """The run as the prediction-error fit follows it, with neutral parameters of its own."""
+        n = self.zero.size
+        sampled = 1.0 / float(np.median(np.diff(self.t)))
+        # 100 Hz for a bench of carts, which is some twenty readings per swing.
+        thin = replace(self, block=max(1, int(sampled * self.pace / 100.0))).thin
+        rows, free = list(self.rows), np.array(self.free)
+        y, weight = np.zeros((thin.t.size, n)), np.zeros((thin.t.size, n))
+        y[:, rows], weight[:, rows] = thin.y.T, (thin.weight / thin.sigma[:, None]).T
+        return PemRunArrays(
+            t=np.array(thin.t),  # a copy, as numba would compile again for a read-only array
+            y=y,
+            weight=weight,
+            seen=np.isin(np.arange(n), rows) & free,
+            free=free,
+            guided=np.ascontiguousarray(thin.guided.T),
+            knots=np.array(self.knots, dtype=np.float64),
+            command=np.array(self.command, dtype=np.float64),
+            held=np.zeros((3, 2, self.knots.size)),
+            zero=self.zero,
+            factor=np.ones(n),
+            gain=0.0,
+            longest=_LONGEST * self.pace,
+        )
 
     def thinned(self, y: Array) -> Array:
         """Return readings (…, samples) averaged in blocks of samples, see `thin`.

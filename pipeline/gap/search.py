@@ -35,7 +35,7 @@ from pipeline.gap.judge import (
 )
 from pipeline.gap.parameters import Candidate, GapModel, Nuisance
 from pipeline.gap.pem.fit import PemFit, Records, choose_laws, rivals_of
-from pipeline.gap.pem.model import make_pem_run
+from pipeline.gap.pem.model import RunParameters
 from pipeline.gap.runs import GapRun
 from pipeline.gap.types import Verdict
 from pipeline.plant.catalogue import find_effect
@@ -157,7 +157,7 @@ def _compliance(chain: Chain, run: GapRun, cart: int) -> Array:
 def follow(runs: Sequence[GapRun], catalogue: Iterable[Effect], mapper: Mapper) -> Records:
     """Return the runs as the prediction-error fit follows them."""
     return Records(
-        runs=tuple(make_pem_run(run) for run in runs),
+        runs=tuple(runs),
         mapper=mapper,
         columns=frozenset().union(*(filled(effect) for effect in catalogue)),
     )
@@ -186,9 +186,9 @@ def are_followed(
     most = _AS_NOISE * min(max(1.0, noise), _MOST_NOISE)
     out = []
     for run, start, end in windows:
-        track = make_pem_run(run)
-        alone = replace(records, runs=(track,)).evaluate(replace(model, own=(track.fresh(),)))
-        inside = (track.t >= start) & (track.t <= end)
+        own = (RunParameters.of(run),)
+        alone = replace(records, runs=(run,)).evaluate(replace(model, own=own))
+        inside = (run.followed.t >= start) & (run.followed.t <= end)
         if fine := bool(np.isfinite(alone.cost) and inside.any()):
             fine = bool(np.mean(alone.errors[0][:, inside] ** 2) < most)
         out.append(fine)

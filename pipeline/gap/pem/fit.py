@@ -20,7 +20,6 @@ from pipeline.gap.pem.model import (
     POSITIVE,
     Column,
     LawSet,
-    PemRun,
     PemSetup,
     RunParameters,
     TrialLaw,
@@ -28,7 +27,7 @@ from pipeline.gap.pem.model import (
     errors_of,
     smooth_laws,
 )
-from pipeline.gap.runs import independent
+from pipeline.gap.runs import GapRun, independent
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
 from pipeline.plant.simulator.terms import EffectKind
@@ -108,7 +107,7 @@ class Slope:
 class Records:
     """The data to follow: the runs, their mapper, and the columns that laws may fill."""
 
-    runs: tuple[PemRun, ...]
+    runs: tuple[GapRun, ...]
     mapper: Mapper
     columns: frozenset[Column]
 
@@ -118,26 +117,26 @@ class Records:
 
     def begin(self, laws: LawSet, p: Array, *, gain: float) -> PemFit:
         """Return a model before any fit."""
-        own = tuple(track.fresh() for track in self.runs)
+        own = tuple(map(RunParameters.of, self.runs))
         return self.evaluate(PemFit(laws=laws, p=p, own=own, gain=gain, cost=np.inf, points=1.0))
 
     def evaluate(self, fit: PemFit) -> PemFit:
         """Return the model with its cost, which is infinite if the simulation diverges."""
         laws, dry = fit.laws, fit.laws.dry
 
-        def one(pair: tuple[PemRun, RunParameters]) -> tuple[tuple[float, float], Array]:
-            track, own = pair
-            run = errors_of(laws, fit.p, track, own, gain=fit.gain, derive=False)
-            if run is None:
+        def one(pair: tuple[GapRun, RunParameters]) -> tuple[tuple[float, float], Array]:
+            run, own = pair
+            told = errors_of(laws, fit.p, run, own, gain=fit.gain, derive=False)
+            if told is None:
                 return (np.inf, np.inf), np.zeros((1, 1))  # counts as one reading
-            left = run[0] * track.weight
-            prior = track.prior(own, dry)[1]
+            left = told[0] * run.followed.weight
+            prior = own.prior(run, dry)[1]
             cost = float((left**2).sum()), float((prior**2).sum())
-            return cost, left[:, track.seen].T
+            return cost, left[:, run.followed.seen].T
 
         told = self.mapper(one, zip(self.runs, fit.own, strict=True))
         costs, errors = zip(*told, strict=True)
-        points = sum(track.points for track in self.runs)
+        points = sum(map(_points, self.runs))
         cost, prior = np.sum(costs, axis=0).tolist()
         return replace(fit, cost=cost, points=points, prior=prior, errors=errors)
 
@@ -146,20 +145,20 @@ class Records:
         laws, size, inflate = fit.laws, fit.p.size, fit.inflation
         dry = laws.dry & factors
 
-        def one(pair: tuple[PemRun, RunParameters]) -> tuple[Array, Array, Array]:
-            track, own = pair
-            run = errors_of(laws, fit.p, track, own, gain=fit.gain, derive=True)
+        def one(pair: tuple[GapRun, RunParameters]) -> tuple[Array, Array, Array]:
+            run, own = pair
+            told = errors_of(laws, fit.p, run, own, gain=fit.gain, derive=True)
             # An almost infinite slope has no finite square.
-            if run is None or not np.vdot(run[1], run[1]) < 1e200:
+            if told is None or not np.vdot(told[1], told[1]) < 1e200:
                 nothing = np.full((size, size), np.nan)
                 return nothing, nothing[0], nothing
-            E, J = run
-            weight = track.weight[:, track.seen]
-            J = J if track.seen.all() else np.ascontiguousarray(J[:, :, track.seen])
+            (E, J), seen = told, run.followed.seen
+            weight = run.followed.weight[:, seen]
+            J = J if seen.all() else np.ascontiguousarray(J[:, :, seen])
             J *= weight
             J = J.reshape(len(J), -1)
-            A, r = J @ J.T, J @ (E[:, track.seen] * weight).ravel()
-            hold, off = track.prior(own, dry)
+            A, r = J @ J.T, J @ (E[:, seen] * weight).ravel()
+            hold, off = own.prior(run, dry)
             mine = A[size:, size:] + np.diag((inflate * hold) ** 2)
             mine += _RIDGE * np.diag(np.diag(mine))
             right = np.column_stack([A[size:, :size], r[size:] + inflate**2 * hold * off])
@@ -189,8 +188,8 @@ class Records:
             for _attempt in range(6):
                 delta = _step(slope, best.p, bounds, damp=damp)
                 own = tuple(
-                    track.moved(one, taken[:, -1] - taken[:, :-1] @ delta)
-                    for track, one, taken in zip(self.runs, best.own, slope.back, strict=True)
+                    one.moved(taken[:, -1] - taken[:, :-1] @ delta)
+                    for one, taken in zip(best.own, slope.back, strict=True)
                 )
                 trial = self.evaluate(replace(best, p=best.p + delta, own=own))
                 if trial.cost + best.inflation**2 * trial.prior < best.total:
@@ -204,6 +203,13 @@ class Records:
             if fall < 1e-3:
                 break
         return best
+
+
+def _points(run: GapRun) -> float:
+    """Return the number of readings of a run, each counted by its weight."""
+    weight = run.followed.weight
+    largest = np.maximum(weight.max(axis=0), 1e-300)
+    return float(((weight / largest) ** 2).sum())
 
 
 def _step(slope: Slope, p: Array, bounds: tuple[Array, Array, Array], *, damp: float) -> Array:
@@ -288,7 +294,8 @@ def shaped_laws(fit: PemFit, records: Records) -> list[TrialLaw]:
     position = np.zeros((2, n))
     stretch = np.zeros((2, n + 1))
     speed = np.zeros(n)
-    for track, own in zip(records.runs, fit.own, strict=True):
+    for run, own in zip(records.runs, fit.own, strict=True):
+        track = run.followed
         x = np.where(track.free, track.y - own.zero, 0.0)
         position = np.maximum(position, [x.max(0), -x.min(0)])
         d = np.diff(np.pad(x, ((0, 0), (1, 1))), axis=1)
@@ -334,9 +341,9 @@ def _to_both_sides(most: Array, parts: Sequence[float]) -> list[float]:
 def cogging_laws(fit: PemFit, records: Records) -> list[TrialLaw]:
     """Return cogging at trial pitches, close enough that its phase fits over the whole travel."""
     span = 0.0
-    for track, own in zip(records.runs, fit.own, strict=True):
-        if track.free[0]:
-            span = max(span, float(np.ptp(track.y[:, 0] - own.zero[0])))
+    for run, own in zip(records.runs, fit.own, strict=True):
+        if run.free[0]:
+            span = max(span, float(np.ptp(run.followed.y[:, 0] - own.zero[0])))
     if span == 0.0 or (EffectKind.COGGING, 0) in fit.laws.keys:
         return []
     # Numbers of pitches in the travel, in steps of less than one half.
@@ -347,9 +354,9 @@ def cogging_laws(fit: PemFit, records: Records) -> list[TrialLaw]:
 def backlash_laws(fit: PemFit, records: Records) -> list[TrialLaw]:
     """Return trial laws for backlash at the motor, which no fit from zero can find."""
     spans = [
-        float(np.ptp(track.y[:, 0]))
-        for track in records.runs
-        if track.free[0] and track.seen[0] and np.any(track.command)
+        float(np.ptp(run.followed.y[:, 0]))
+        for run in records.runs
+        if run.followed.seen[0] and np.any(run.command)
     ]
     if not spans or (EffectKind.BACKLASH, 0) in fit.laws.keys:
         return []
@@ -490,9 +497,8 @@ def start_all(records: Records, *, springs: Sequence[bool], chains: Sequence[Cha
 
     The fit is done from each of the `chains`; the best result is returned.
     """
-    tracks = records.runs
-    largest = max(float(np.abs(track.command).max()) for track in tracks)
-    free = tuple(tuple(track.free.tolist()) for track in tracks)
+    largest = max(float(np.abs(run.command).max()) for run in records.runs)
+    free = tuple(run.free for run in records.runs)
     pinned = int(np.argmax(np.any(free, axis=0))) if largest == 0.0 else None
 
     def fitted(chain: Chain) -> PemFit:

@@ -57,11 +57,12 @@ class ActingLaws(NamedTuple):
 
 
 class PemRunArrays(NamedTuple):
-    """One run of n carts and the options of its simulation.
+    """One run of n carts, thinned, and the options of its simulation.
 
     Attributes
     ----------
     t, y : times (samples,) and readings (samples, n).
+    weight : weight (samples, n) of each reading, over the noise.
     seen, free : whether each cart is compared, and whether it moves (n,).
     guided : motion (samples, n) of held carts.
     knots, command : times and values of the input, held from knot to knot.
@@ -74,6 +75,7 @@ class PemRunArrays(NamedTuple):
 
     t: Array
     y: Array
+    weight: Array
     seen: NDArray[np.bool_]
     free: NDArray[np.bool_]
     guided: Array

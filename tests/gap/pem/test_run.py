@@ -11,7 +11,6 @@ from pipeline.gap.pem.model import (
     RunParameters,
     TrialLaw,
     errors_of,
-    make_pem_run,
 )
 from pipeline.gap.runs import make_run
 from pipeline.plant.chain import Chain
@@ -48,11 +47,11 @@ def test_derivatives_agree_with_differences_of_the_errors(kind, gain):
     """Derivatives with respect to parameters and a run's start agree with finite differences."""
     case = make_case(seed=44, n=2, rate=113.1)
     chain = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
-    track = make_pem_run(make_run(case.records[0], n=2))
-    largest, top = float(np.abs(track.command).max()), float(np.abs(track.y).max())
+    run = make_run(case.records[0], n=2)
+    largest, top = float(np.abs(run.command).max()), float(np.abs(run.y).max())
     bench = PemSetup(chain=chain, springs=case.springs, largest=largest, free=((True, True),))
     values = SIZES[kind](largest, top, float(chain.m[0]), float(chain.k[1]))
-    own = track.fresh()
+    own = RunParameters.of(run)
     start = np.concatenate([own.zero, own.shift + 0.01 * top, own.v0 + 0.1, own.factor])
 
     for place in (0,) if kind in DRIVEN else (0, 1):
@@ -64,7 +63,7 @@ def test_derivatives_agree_with_differences_of_the_errors(kind, gain):
         def errors(both, *, derive=False, laws=laws):
             size = laws.size
             mine = RunParameters(**dict(zip(vars(own), both[size:].reshape(4, 2), strict=True)))
-            told = errors_of(laws, both[:size], track, mine, gain=gain, derive=derive)
+            told = errors_of(laws, both[:size], run, mine, gain=gain, derive=derive)
             assert told is not None
             return told
 
