@@ -289,8 +289,9 @@ def _driven(chain: Chain, limits: PlanLimits) -> list[Recording]:
     for number, hertz in enumerate(simulate.dwell_frequencies(chain, n=_DWELLS), start=1):
         cycles = ceil(hertz * (wait + simulate.steady_time(hertz)))
         t = np.arange(0.0, cycles / hertz, min(0.005, 1 / (40 * hertz)))
-        unit = simulate.largest_motion(chain, t, shape=np.sin(2 * np.pi * hertz * t), wait=wait)
-        amplitude = min(aim / unit.steady, furthest / unit.furthest, limits.input)
+        shape = np.sin(2 * np.pi * hertz * t)
+        steady, most = simulate.largest_motion(chain, t, shape=shape, wait=wait)
+        amplitude = min(aim / steady, furthest / most, limits.input)
         recordings.append(
             Recording(
                 id=f"sine-{number:02d}",

@@ -592,14 +592,16 @@ def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> Gap
     Laird, Controlled Clinical Trials 7 (1986), 177-188).
     """
 
-    def weigh(job: tuple[int, tuple[GapRun, Nuisance]]) -> _Weighed:
+    def weigh(
+        job: tuple[int, tuple[GapRun, Nuisance]],
+    ) -> tuple[Array, dict[int, tuple[float, float]]]:
         index, (run, nuisance) = job
         # Seeded by the run's index, so that each run has its own draws.
         rng = np.random.default_rng([0, index])
         return _weigh(fit, run, nuisance, rng=rng)
 
     weighed = list(mapper(weigh, enumerate(zip(runs, fit.nuisance, strict=True))))
-    told = np.sum([one.told for one in weighed], axis=0)
+    told = np.sum([of_run for of_run, _ in weighed], axis=0)
     if not np.all(np.isfinite(told)):
         return fit
     held = anchor(runs, fit.theta.size)[:, :-1]
@@ -616,31 +618,26 @@ def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> Gap
     # The encoders cause no error in a direction that no run determines; its variance is that of
     # H⁻¹.
     np.fill_diagonal(cov, np.maximum(np.diag(cov), least))
-    return replace(fit, covariance=cov, between_runs=_varying_friction(fit, weighed))
+    return replace(
+        fit, covariance=cov, between_runs=_varying_friction(fit, [f for _, f in weighed])
+    )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Weighed:
-    """What one run tells about the parameters.
+def _weigh(
+    fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator
+) -> tuple[Array, dict[int, tuple[float, float]]]:
+    """Return what one run tells about the parameters, and about the friction of each cart.
 
-    Attributes
-    ----------
-    told : H, S from encoder errors, and S from the residual's correlation, each (size, size). All
-        of them are NaN if the model diverges at these parameters or next to them.
-    factors : for each cart with dry friction, the deviation of its friction in this run from that
-        of the model, relative, and the information about it.
+    The first is H, S from encoder errors, and S from the residual's correlation, (3, size, size),
+    all NaN if the model diverges at these parameters or next to them. The second is, for each cart
+    with dry friction, the deviation of its friction in this run from that of the model, relative,
+    and the information about it.
     """
-
-    told: Array
-    factors: dict[int, tuple[float, float]] = field(default_factory=dict)
-
-
-def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator) -> _Weighed:
     thin, inflate = run.thin, fit.inflation
     layout = layout_of(fit.structure, thin, scatter_free=True)
     columns = columns_of(fit, thin, nuisance, layout)
     if not np.all(np.isfinite(columns)):
-        return _Weighed(told=np.full((3, fit.theta.size, fit.theta.size), np.nan))
+        return np.full((3, fit.theta.size, fit.theta.size), np.nan), {}
     columns = columns * thin.weight / thin.sigma[:, None]
     starts = len(layout.x0) + len(layout.v0)
     local = starts + len(layout.scatter) + len(layout.zero)
@@ -670,25 +667,23 @@ def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Gener
     weight = J * thin.weight / thin.sigma[:, None]
     errors = np.array(list(_errors(fit, run, nuisance, rng=rng)))
     scores = np.tensordot(errors, weight, axes=((1, 2), (1, 2)))
-    return _Weighed(
-        told=np.stack([H, scores.T @ scores / _DRAWS, score_covariance(columns[-1], J)]),
-        factors={
-            i: (float(told[j] / sizes[j]), float(sizes[j]))
-            for j, i in enumerate(layout.scatter)
-            if sizes[j] > 0.0
-        },
-    )
+    factors = {
+        i: (float(told[j] / sizes[j]), float(sizes[j]))
+        for j, i in enumerate(layout.scatter)
+        if sizes[j] > 0.0
+    }
+    return np.stack([H, scores.T @ scores / _DRAWS, score_covariance(columns[-1], J)]), factors
 
 
-def _varying_friction(fit: GapFit, weighed: Sequence[_Weighed]) -> Array:
+def _varying_friction(fit: GapFit, runs: Sequence[dict[int, tuple[float, float]]]) -> Array:
     """Return the covariance (size, size) that the variation of dry friction between runs causes.
 
     All dry friction of a cart has the same factor in a run. The recordings show the friction only
     multiplied by the mean of the factors.
     """
     out = np.zeros((fit.theta.size, fit.theta.size))
-    for i in {i for one in weighed for i in one.factors}:
-        factors, weight = np.array([one.factors[i] for one in weighed if i in one.factors]).T
+    for i in {i for of_run in runs for i in of_run}:
+        factors, weight = np.array([of_run[i] for of_run in runs if i in of_run]).T
         if fit.scattered:
             variance = float(fit.spread[i]) ** 2 / weight.size
         else:

@@ -9,7 +9,7 @@ come from the same fit with one law exchanged.
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -86,24 +86,18 @@ class Deadline:
 # if other carts are held, other springs balance the same force.
 
 
-@dataclass(frozen=True, kw_only=True)
-class Offset:
-    """A constant force on a cart; its standard error comes from the scatter between runs."""
-
-    cart: int
-    force: float
-    std: float
-
-
 def find_offset(
     chain: Chain, runs: Sequence[GapRun], nuisance: Sequence[Nuisance]
-) -> Offset | None:
-    """Return the constant force that explains the fitted encoder zeros, if any is certain."""
+) -> tuple[int, float] | None:
+    """Return the cart and the constant force that explain the fitted encoder zeros, if certain.
+
+    The standard error of the force comes from the scatter between runs.
+    """
     if not np.any(chain.k > 0):
         return None
     if len({run.free for run in runs}) == 1 and not any(run.at_rest for run in runs):
         return None  # the force would look like a wrong encoder zero
-    best: tuple[float, Offset] | None = None
+    best: tuple[float, int, float] | None = None
     total, step = 0.0, 0.0
     for run, one in zip(runs, nuisance, strict=True):
         zeros = one.zero[list(run.rows)]
@@ -134,8 +128,8 @@ def find_offset(
             and unexplained < (1.0 - limits.OFFSET_SHARE) * total
             and (best is None or unexplained < best[0])
         ):
-            best = (unexplained, Offset(cart=cart, force=float(forces.mean()), std=std))
-    return best[1] if best else None
+            best = (unexplained, cart, float(forces.mean()))
+    return best[1:] if best else None
 
 
 def _compliance(chain: Chain, run: GapRun, cart: int) -> Array:
@@ -417,8 +411,8 @@ class Search:
         offset = find_offset(structure.chain(chosen.fit.theta), runs, nuisance)
         if effect is None or offset is None:
             return
-        holding = holding_force(chosen.fit.tables)
-        if abs(offset.force) < holding[offset.cart - 1]:
+        cart, force = offset
+        if abs(force) < holding_force(chosen.fit.tables)[cart - 1]:
             # Effects such as friction can hold a cart this far from its equilibrium, so its rest
             # proves nothing.
             return
@@ -430,13 +424,11 @@ class Search:
             )
             for width in (1e-4, 0.5)  # width of the zeros, times the noise: exact, or rounded
         )
-        candidate = Candidate(
-            effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
-        )
+        candidate = Candidate(effect=effect, place=cart, signs=(1.0,), scales=(abs(force),))
         without = tuple(
             judge(fit_free_run(h.fit.without_nuisance, pinned), pinned) for h in self.path
         )
-        fit = fit_free_run(chosen.fit.with_effect(candidate, (offset.force,)), loose)
+        fit = fit_free_run(chosen.fit.with_effect(candidate, (force,)), loose)
         final = judge(fit, loose)
         as_good = limits.OFFSET_AS_FREE * chosen.error
         if final.error > min(limits.OFFSET_GAIN * without[-1].error, as_good):

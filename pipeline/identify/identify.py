@@ -203,9 +203,7 @@ def _log_decrements(
             _skip_without(log, Stage.LOG_DECREMENT, what, out=out, cart=cart)
         for run in swinging:
             find = partial(_decays_between, between(run, interventions), cart=cart)
-            known = log.measured.decays
-            seen = log.attempt_once(Stage.LOG_DECREMENT, find, known, of=run.id, cart=cart)
-            decays += seen or ()
+            decays += log.attempt_once(Stage.LOG_DECREMENT, find, of=run.id, cart=cart) or ()
     return decays
 
 
@@ -253,7 +251,7 @@ def _step_gains(runs: Runs, *, bench: Setup, log: Log) -> list[StepGain]:
     for run in steps:
         for cart in run.carts:
             fit = partial(fit_static_gain, run, cart=cart)
-            gain = log.attempt_once(Stage.STEP_GAIN, fit, log.measured.gains, of=run.id, cart=cart)
+            gain = log.attempt_once(Stage.STEP_GAIN, fit, of=run.id, cart=cart)
             if gain:
                 gains.append(gain)
     return gains
@@ -265,7 +263,7 @@ def _sine_points(records: Sequence[Record], *, log: Log) -> list[SinePoint]:
         dwell = Dwell(run)
         for cart in run.carts if run.kind == "sine" else ():
             fit = partial(dwell.fit, cart=cart)
-            point = log.attempt_once(Stage.SINE, fit, log.measured.points, of=run.id, cart=cart)
+            point = log.attempt_once(Stage.SINE, fit, of=run.id, cart=cart)
             if point and (fault := dwell_fault(point)):
                 log.skip(Stage.SINE, fault, run=run.id, cart=cart)
             elif point:
@@ -341,7 +339,7 @@ def identify_with_rejection(
     left_out = find_outlier_repeats(driven, unit=bench.units.position) | shown
     without = left_out.keys() | standing_still(data.records)
     again = partial(identify, data, interventions=interventions, bench=bench, progress=progress)
-    again = partial(again, measured=Measured())
+    again = partial(again, measured={})
     found = again(without=without)
     for _ in range(_ROUNDS):
         # If too few records remain to identify the carts, the earlier result is kept.

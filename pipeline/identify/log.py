@@ -2,23 +2,15 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from pipeline.errors import DataError
-from pipeline.results import LogDecrement, SinePoint, Skipped, Stage, StepGain
+from pipeline.results import Skipped, Stage
 
 T = TypeVar("T")
-# The result of a stage, or its error, by record and cart.
-Known: TypeAlias = dict[tuple[str, int], T | DataError]
-
-
-@dataclass(frozen=True)
-class Measured:
-    """The results that depend on a single record; they stay the same if others are left out."""
-
-    decays: Known[list[LogDecrement]] = field(default_factory=dict)
-    gains: Known[StepGain] = field(default_factory=dict)
-    points: Known[SinePoint] = field(default_factory=dict)
+# The result of a stage that uses a single record, or its error, by stage, record and cart. It stays
+# the same if other records are left out.
+Measured: TypeAlias = dict[tuple[Stage, str, int], Any]
 
 
 @dataclass
@@ -27,7 +19,7 @@ class Log:
 
     skipped: list[Skipped] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    measured: Measured = field(default_factory=Measured)
+    measured: Measured = field(default_factory=dict)
 
     def attempt(self, stage: Stage, run: Callable[[], T], *, of: str = "") -> T | None:
         """Run one stage; if the data are unsuitable, note the reason and return None.
@@ -40,16 +32,14 @@ class Log:
             self.skip(stage, str(error), run=of)
             return None
 
-    def attempt_once(
-        self, stage: Stage, run: Callable[[], T], known: Known[T], *, of: str, cart: int
-    ) -> T | None:
-        """Run a stage of one record as `attempt` does, and once only: `known` keeps its result."""
-        if (of, cart) not in known:
+    def attempt_once(self, stage: Stage, run: Callable[[], T], *, of: str, cart: int) -> T | None:
+        """Run a stage of one record as `attempt` does, but only if `measured` lacks its result."""
+        if (stage, of, cart) not in self.measured:
             try:
-                known[of, cart] = run()
+                self.measured[stage, of, cart] = run()
             except DataError as error:
-                known[of, cart] = error
-        found = known[of, cart]
+                self.measured[stage, of, cart] = error
+        found = self.measured[stage, of, cart]
         if isinstance(found, DataError):
             self.skip(stage, str(found), run=of, cart=cart)
             return None

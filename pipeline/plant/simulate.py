@@ -1,7 +1,6 @@
 """Simulate a chain exactly, at any sample times; measure step responses, plan sine dwells."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import isqrt
 
 import numpy as np
@@ -180,24 +179,10 @@ def steady_time(hertz: float) -> float:
     return max(6.5 / hertz, 1.4)
 
 
-@dataclass(frozen=True, kw_only=True)
-class LargestMotion:
-    """The largest motion of any cart per unit of input, in position units.
+def largest_motion(chain: Chain, t: Array, *, shape: Array, wait: float) -> tuple[float, float]:
+    """Return the largest motion of any cart, from rest, under the input `shape` (n,).
 
-    Attributes
-    ----------
-    steady : the largest motion after the transient.
-    furthest : the largest motion at any time.
-    """
-
-    steady: float
-    furthest: float
-
-
-def largest_motion(chain: Chain, t: Array, *, shape: Array, wait: float) -> LargestMotion:
-    """Return the largest motions from rest under the input `shape` (n,).
-
-    The transient lasts `wait` s.
+    The first number is for the time after the transient of `wait` s, the second for all times.
     """
     unit = np.abs(simulate_linear(chain, t, shape))
-    return LargestMotion(steady=float(np.max(unit[:, t >= wait])), furthest=float(np.max(unit)))
+    return float(np.max(unit[:, t >= wait])), float(np.max(unit))

@@ -124,11 +124,9 @@ def plan_dwells(session: SimulatedSession) -> list[BenchRun]:
         wait = simulate.settling_wait(chain, time_constants=settled)
         t = session.clock(wait + simulate.steady_time(hertz))
         shape = np.sin(2 * np.pi * hertz * t)
-        unit = simulate.largest_motion(chain, t, shape=shape, wait=wait)
+        steady, most = simulate.largest_motion(chain, t, shape=shape, wait=wait)
         # Far above the resonances, the carts swing far at first, then hardly move.
-        amplitude = _typed(
-            session.bench.travel * min(0.8 / unit.steady, 1.5 / unit.furthest), session
-        )
+        amplitude = _typed(session.bench.travel * min(0.8 / steady, 1.5 / most), session)
         runs.append(
             BenchRun(
                 id=f"sine-{number:02d}",

@@ -234,16 +234,11 @@ def _step(slope: Slope, p: Array, bounds: tuple[Array, Array, Array], *, damp: f
 # Reference: T. Söderström, P. Stoica, System Identification, section 11.5 (score tests).
 
 
-@dataclass(frozen=True, kw_only=True)
-class Scored:
-    """A law with its best values, and the decrease of the cost that these would give."""
+def score(fit: PemFit, records: Records, trials: Sequence[TrialLaw]) -> list[TrialLaw]:
+    """Return the trial laws that would help in addition to the model's laws, the best first.
 
-    law: TrialLaw
-    drop: float
-
-
-def score(fit: PemFit, records: Records, trials: Sequence[TrialLaw]) -> list[Scored]:
-    """Return the trial laws that would help in addition to the model's laws, the best first."""
+    They have their best values, and the decrease of the cost that these would give.
+    """
     laws, p = fit.laws.with_laws(fit.p, trials)
     wide = replace(fit, laws=laws, p=p)
     slope = records.slope(wide)
@@ -281,7 +276,7 @@ def score(fit: PemFit, records: Records, trials: Sequence[TrialLaw]) -> list[Sco
         values = list(law.values)
         for i, value in zip(mine, found, strict=True):
             values[i - o] = float(value)
-        out.append(Scored(law=replace(law, values=tuple(values)), drop=drop))
+        out.append(replace(law, values=tuple(values), drop=drop))
     return sorted(out, key=lambda one: -one.drop)
 
 
@@ -366,7 +361,7 @@ def backlash_laws(fit: PemFit, records: Records) -> list[TrialLaw]:
     return [law] if records.allows(law) else []
 
 
-def shaped_trials(fit: PemFit, records: Records) -> list[Scored]:
+def shaped_trials(fit: PemFit, records: Records) -> list[TrialLaw]:
     """Return the laws with a shape that would help the model, the best first.
 
     Only the best shape of each law at each place and side is returned.
@@ -378,10 +373,10 @@ def shaped_trials(fit: PemFit, records: Records) -> list[Scored]:
         part = replace(records, runs=tuple(records.runs[i] for i in moving))
         own = tuple(fit.own[i] for i in moving)
         trials += score(replace(fit, own=own), part, cogging)
-    best: dict[tuple, Scored] = {}
+    best: dict[tuple, TrialLaw] = {}
     for one in sorted(trials, key=lambda one: -one.drop):
         if one.drop > 0.0:
-            best.setdefault(one.law.sided, one)
+            best.setdefault(one.sided, one)
     return list(best.values())
 
 
@@ -543,7 +538,7 @@ def choose_laws(
 def add_shaped(fit: PemFit, records: Records) -> PemFit | None:
     """Return the model with one more law that has a shape, or None if no such law helps."""
     best: PemFit | None = None
-    trials = [one.law for one in shaped_trials(fit, records)[:_SHORT_LIST]]
+    trials = shaped_trials(fit, records)[:_SHORT_LIST]
     for law in (*trials, *backlash_laws(fit, records)):
         laws, p = fit.laws.with_laws(fit.p, [law])
         trial = records.refit(fit, laws, p, iterations=8)
@@ -618,10 +613,8 @@ def rivals_of(lean: PemFit, records: Records) -> list[PemFit]:
         taken = {gone, *laws.keys}
         plain = [TrialLaw(kind=kind, place=place, values=(0.0,)) for kind, place in everything.keys]
         trials = [*score(bare, records, plain), *shaped_trials(bare, records)]
-        trials = sorted(
-            (one for one in trials if one.law.key not in taken), key=lambda one: -one.drop
-        )
-        exchanged = [laws.with_laws(bare.p, [one.law]) for one in trials[:_SHORT_LIST]]
+        trials = sorted((one for one in trials if one.key not in taken), key=lambda one: -one.drop)
+        exchanged = [laws.with_laws(bare.p, [one]) for one in trials[:_SHORT_LIST]]
         for q, free in enumerate(everything.drive):
             if free and not laws.drive[q] and group != -1 - q:
                 drive = tuple(f or i == q for i, f in enumerate(laws.drive))

@@ -61,11 +61,15 @@ def column_set(columns: Iterable[IntEnum]) -> frozenset[Column]:
 
 @dataclass(frozen=True, kw_only=True)
 class TrialLaw:
-    """A law at a cart or spring (from 0), with the values of its parameters."""
+    """A law at a cart or spring (from 0), with the values of its parameters.
+
+    `drop` is the decrease of the cost that these values would give, if it is known.
+    """
 
     kind: int
     place: int
     values: tuple[float, ...]
+    drop: float = 0.0
 
     @property
     def key(self) -> tuple[int, int]:
