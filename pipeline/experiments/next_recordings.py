@@ -44,7 +44,6 @@ from pipeline.gap.types import Proposal, read_gap
 from pipeline.ingest.read import read_data
 from pipeline.names import parameter_names
 from pipeline.plant.chain import Chain
-from pipeline.plant.limits import CALIBRATION
 from pipeline.plant.simulate import SETTLED, SETTLED_DWELL, dwell_frequencies, settling_wait
 from pipeline.results import Analysis
 from pipeline.submission import Submission
@@ -297,6 +296,7 @@ def far_sweep(chain: Chain, limits: PlanLimits) -> Recording:
 # ---------------------------------------------------------------------- the choice
 
 _ALONE = 4  # most planned recordings whose own benefit is listed
+CALIBRATION = 1e-3  # relative error; encoders and motor of a bench are not known more accurately
 STATISTICAL = (
     "these errors include only noise; no bench is calibrated to better than "
     f"{100 * CALIBRATION:g} %"

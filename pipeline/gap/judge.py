@@ -357,7 +357,6 @@ def make_candidate(
 # below. Its laws are fitted alone, then together, each time from a new start.
 
 _TRIED = 3  # effects to try beside those already chosen, in the order of their errors alone
-_TO_THE_END: dict[str, Any] = {"iterations": 40, "tolerance": 1e-5}
 
 
 def build_up(full: Hypothesis, baseline: Hypothesis, study: Study) -> list[Hypothesis]:

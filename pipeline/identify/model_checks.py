@@ -18,8 +18,11 @@ from pipeline.estimation.estimates import SIGMA_LIMIT, change_limit
 from pipeline.identify.findings import say
 from pipeline.names import gain_name, own_zeta, read_name, toml_flags
 from pipeline.plant.chain import Chain
-from pipeline.plant.identities import interlacing_brackets, recover_from_parameters
-from pipeline.plant.limits import HEAVY_DAMPING
+from pipeline.plant.identities import (
+    HEAVY_DAMPING,
+    interlacing_brackets,
+    recover_from_parameters,
+)
 from pipeline.plant.margins import Margins, stability_margins
 from pipeline.plant.sampled_loop import discretise
 from pipeline.results import (

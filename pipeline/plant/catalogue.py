@@ -22,9 +22,13 @@ from pipeline.plant.effect import (
     HysteresisLaw,
     InputLaw,
 )
-from pipeline.plant.limits import LEAST_SLIDING, MUCH_SHORTER
 from pipeline.words.math import NO_BREAK, WIDE_SPACE, dot, function, parens, row, sub
 
+# In sample times. A delay and a lag of the same size T delay the input equally on average. They
+# first differ in the second moment, by T²/2. At this limit that is an eighth of a squared sample
+# time.
+MUCH_SHORTER = 0.5
+LEAST_SLIDING = 0.01  # share of the friction at rest; any dry surface has more while it slides
 FORCE = EffectParameter(
     "force", "F", "input", scale="stiffness * position", typical=0.012, neutral=0.0
 )

@@ -18,6 +18,7 @@ from pipeline.arrays import Array
 from pipeline.names import MODES, NULLS, omega_names, read_name
 from pipeline.plant.chain import Chain
 
+HEAVY_DAMPING = 0.3  # damping ratio; above it, resonances and nulls may lose their usual order
 _GAINS = "a cart further from the motor is moved less by a constant input"
 _ALONE = (
     "a cart alone oscillates faster than the first resonance of all carts and slower than the last"

@@ -8,8 +8,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.plant.chain import Chain, quadratic_factors
-from pipeline.plant.limits import SETTLING_BAND
 
+SETTLING_BAND = 0.02  # share of the change in level: the 2 % criterion
 OVERSAMPLING = 8  # points between samples for a band-limited input
 _LANCZOS_WIDTH = 12  # samples that the interpolation kernel spans on each side
 

@@ -14,7 +14,11 @@ import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
-from pipeline.estimation.state_feedback import level_error_percent, static_levels
+from pipeline.estimation.state_feedback import (
+    MASS_SPRING_ERROR,
+    level_error_percent,
+    static_levels,
+)
 from pipeline.grading import limits
 from pipeline.grading.grade import Flag
 from pipeline.grading.mistakes.state_model import Order, own_chain
@@ -24,7 +28,6 @@ from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.plant import simulate
 from pipeline.plant.chain import Chain
-from pipeline.plant.limits import MASS_SPRING_ERROR
 from pipeline.plant.sampled_loop import discretise
 from pipeline.results import Analysis
 from pipeline.submission import Design, StateFeedbackController, Submission

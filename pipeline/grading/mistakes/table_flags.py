@@ -17,8 +17,7 @@ from pipeline.grading.reference import Reference, References
 from pipeline.grading.tolerance import as_typed, half_digit, is_vague, percent_off, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
-from pipeline.plant.identities import parameter_orders
-from pipeline.plant.limits import HEAVY_DAMPING
+from pipeline.plant.identities import HEAVY_DAMPING, parameter_orders
 from pipeline.submission import Reported
 
 _TOLD: dict[Label, str] = {"initial": "first_estimate", "final": "final_estimate"}
