@@ -1,4 +1,8 @@
-"""Export a model to other programs: C, MATLAB and FMU."""
+"""Describe a model by expressions, and export it to other programs: C, MATLAB and FMU.
+
+The compiled simulator is imported where it is needed, because python-control's system, which is
+made from the same description, does without it.
+"""
 
 import ast
 import hashlib
@@ -9,7 +13,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,9 +23,7 @@ import numpy as np
 from pipeline import __version__
 from pipeline.errors import DataError
 from pipeline.plant import effect
-from pipeline.plant.augmented import SteppedBench, rest_positions
 from pipeline.plant.chain import Chain
-from pipeline.plant.simulator.generated_forces import hysteresis
 from pipeline.resources import TEMPLATES
 from pipeline.setup import Units
 
@@ -305,11 +307,11 @@ class Description:
 
     Attributes
     ----------
+    numbers : the parameters of carts and effects.
     play : gap, stiffness and damping; None if there is no play.
     delay, lag : expressions, or "".
     links : each hidden mass, with the force on its cart. The opposite force acts on the mass.
     inputs : title and law of each step from the input to the force `u`.
-    rest : (n_carts,) rest positions, computed without dry friction.
     """
 
     def __init__(
@@ -335,10 +337,10 @@ class Description:
             play = gap, stiffness, damping
         free = sorted(range(1, chain.n + 1) if free is None else free)
         gains = {term.place: f"{_names(term)[0]} * " for term in built["reading"]}
-        step = Parameter("max_step", _longest_step(model, free), "s", "longest step inside")
+        self._model, self._free = model, free
         self.units = units
         self.n = chain.n
-        self.parameters = (*_parameters(chain, terms, units, free), step)
+        self.numbers = _parameters(chain, terms, units, free)
         self.bodies = _bodies(chain, built, free)
         self.springs = _springs(chain, terms, free)
         self.forces = _forces(terms, driven="motor" if play else "cart_1", free=free)
@@ -368,9 +370,22 @@ class Description:
         self.delay = _names(built["delay"][0])[0] if built["delay"] else ""
         self.lag = _names(built["lag"][0])[0] if built["lag"] else ""
         self.readings = tuple(f"{gains.get(i, '')}x.cart_{i}" for i in range(1, chain.n + 1))
-        self.rest = tuple(f"{x + 0.0:.{_DIGITS}g}" for x in rest_positions(model, free=free))
         self.titles = tuple(_title(term) for term in terms)
         self.sign_reversed = sign_reversed
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The `numbers` of the model, and its longest step."""
+        longest = _longest_step(self._model, self._free)
+        return (*self.numbers, Parameter("max_step", longest, "s", "longest step inside"))
+
+    @cached_property
+    def rest(self) -> tuple[str, ...]:
+        """The rest positions (n_carts,), computed without dry friction."""
+        from pipeline.plant.augmented import rest_positions
+
+        at = rest_positions(self._model, free=self._free)
+        return tuple(f"{x + 0.0:.{_DIGITS}g}" for x in at)
 
     @property
     def driven(self) -> str:
@@ -559,6 +574,9 @@ def _longest_step(model: effect.AugmentedChain, free: Sequence[int]) -> float:
     In one step, the fastest oscillation advances by a twentieth of a radian; in a contact, by a
     tenth. cartlab's own simulator is of higher order and takes steps four times as long.
     """
+    from pipeline.plant.augmented import SteppedBench
+    from pipeline.plant.simulator.generated_forces import hysteresis
+
     step = 0.25 * SteppedBench(model, free=free).shortest_step
     cart = model.tables().cart
     for i, mass in enumerate(model.chain.m):

@@ -1,7 +1,7 @@
 """The chain with its effects as an ordinary differential equation, for python-control.
 
-It is built from the laws of the effects. The simulator switches at exact instants, but the
-right-hand side given here suits any solver. Two things are approximate:
+It is built from the same description as the exported programs. The simulator switches at exact
+instants, but the right-hand side given here suits any solver. Two things are approximate:
 
 - Dry friction is set-valued at rest. Here it brakes a slow cart like a damper that would stop it in
   `stop` s, up to the friction's size. So a cart held by friction creeps at force / mass * stop.
@@ -12,16 +12,18 @@ Without effects, the equation is that of the linear chain.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import lru_cache
 from math import cos, exp, pi, sin
+from types import CodeType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import factorial
 
 from pipeline.arrays import Array
-from pipeline.errors import DataError
 from pipeline.plant import effect
+from pipeline.plant.export import Description, Force
+from pipeline.setup import Units
 
 if TYPE_CHECKING:
     import control
@@ -44,21 +46,29 @@ _FUNCTIONS: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True)
-class _Expression:
-    """An expression of a law at one place, with its parameters filled in."""
-
-    code: Any
-    values: Mapping[str, float]
-
-    def __call__(self, **quantities: float) -> float:
-        return float(eval(self.code, _FUNCTIONS, {**self.values, **quantities}))
+@lru_cache(maxsize=256)  # a model has some dozen expressions
+def _compiled(text: str) -> CodeType:
+    return compile(text, "<law>", "eval")
 
 
-def _expression(text: str, term: effect.EffectTerm, **more: float) -> _Expression:
-    symbols = [p.symbol for p in term.effect.parameters]
-    values = dict(zip(symbols, term.values, strict=True))
-    return _Expression(compile(text, "<law>", "eval"), {**values, **more})
+class _Moment:
+    """The values of the names in a model's expressions, at one moment."""
+
+    def __init__(self, **values: Any) -> None:
+        self.values = values
+
+    def value(self, text: str, **more: float) -> float:
+        """Return the value of an expression, in which further names may stand."""
+        return float(eval(_compiled(text), _FUNCTIONS, self.values | more))
+
+    def force(self, part: Force, **more: float) -> float:
+        """Return a force; that of an open contact is zero."""
+        force = self.value(part.force, **more)
+        if not part.side:
+            return force
+        side = 1.0 if self.value(part.side) > 0.0 else -1.0
+        acts = side * self.value(part.depth, **more) > 0.0
+        return force if acts and (part.pulls or side * force < 0.0) else 0.0
 
 
 class EquationsOfMotion:
@@ -66,9 +76,9 @@ class EquationsOfMotion:
 
     Attributes
     ----------
-    states : names of the states. First come x1, v1, x2, v2, …, then the states of the effects: `z1`
-        of a bristle, `x1_hidden` and `v1_hidden` of a hidden mass, `x_motor` and `v_motor` with
-        backlash, `u_lag`, `u_delay_1`, ….
+    states : names of the states. First come x1, v1, x2, v2, …, then the states of the effects:
+        `x_motor` and `v_motor` with backlash, `x1_hidden` and `v1_hidden` of a hidden mass,
+        `u_lag`, `u_delay_1`, …, and `z1` of a bristle.
     """
 
     def __init__(self, model: effect.AugmentedChain) -> None:
@@ -78,77 +88,24 @@ class EquationsOfMotion:
         ------
         DataError : the motor acts before its logged input; no state model can do that.
         """
-        chain, terms = model.chain, model.terms
-        self.n = n = chain.n
-        self._m, self._c, self._k = chain.m.copy(), chain.c, chain.k
-        self.states = [f"{letter}{i + 1}" for i in range(n) for letter in "xv"]
-        self.gains = np.ones(n)
-        self._forces = [
-            (term, _expression(term.effect.law.force, term, **self._spring(term)))
-            for term in terms
-            if isinstance(term.effect.law, effect.ForceLaw)
-        ]
-        self._contacts = [
-            (
-                term,
-                _expression(term.effect.law.force, term, **self._spring(term)),
-                _expression(term.effect.law.past, term)(),
-                term.effect.law.pulls,
-            )
-            for term in terms
-            if isinstance(term.effect.law, effect.ContactLaw)
-        ]
-        self._frictions = [
-            (term.place - 1, _expression(term.effect.law.size, term))
-            for term in terms
-            if isinstance(term.effect.law, effect.FrictionLaw)
-        ]
-        self._inputs = [
-            _expression(term.effect.law.arrives, term)
-            for term in effect.input_steps(terms)
-            if isinstance(term.effect.law, effect.InputLaw)
-        ]
-        self._built: dict[str, list[tuple[effect.EffectTerm, int]]] = {}
-        self._delay: tuple[Array, Array, Array, float] | None = None
-        for term in terms:
-            if isinstance(term.effect.law, effect.BuiltLaw):
-                self._add(term, term.effect.law.kind)
-        self._bristles = [
-            (term.place - 1, _expression(term.effect.law.force, term),
-             _expression(term.effect.law.rate, term), len(self.states) + q)
-            for q, term in enumerate(
-                one for one in terms if isinstance(one.effect.law, effect.HysteresisLaw))
-            if isinstance(term.effect.law, effect.HysteresisLaw)
-        ]  # fmt: skip
-        self.states += [f"z{i + 1}" for i, *_ in self._bristles]
+        self._model = d = Description(model, units=Units(position="", input=""))
+        self._p = SimpleNamespace(**{number.name: number.value for number in d.numbers})
+        self._names = [body.name for body in d.bodies]
+        self.states = [f"{letter}{body.suffix}" for body in d.bodies for letter in "xv"]
+        fixed = _Moment(p=self._p)
+        self._m = np.array([fixed.value(body.mass) for body in d.bodies])
+        self._lag = fixed.value(d.lag) if d.lag else 0.0
+        self._delay = _pade(fixed.value(d.delay)) if d.delay else None
+        if d.lag:
+            self.states.append("u_lag")
+        if d.delay:
+            self.states += [f"u_delay_{q + 1}" for q in range(_PADE_ORDER)]
+        self.states += [bristle.name for bristle in d.bristles]
 
-    def _spring(self, term: effect.EffectTerm) -> dict[str, float]:
-        return {"k": float(self._k[term.place - 1])} if term.effect.place == "spring" else {}
-
-    def _add(self, term: effect.EffectTerm, kind: str) -> None:
-        i, own = term.place, []
-        match kind:
-            case "reading":
-                self.gains[i - 1] = term.values[0]
-            case "hidden mass":
-                own = [f"x{i}_hidden", f"v{i}_hidden"]
-            case "play":
-                own = ["x_motor", "v_motor"]
-                # With backlash, cart 1 keeps at least a fiftieth of its mass when the motor's mass
-                # is separated.
-                self._m[0] = max(self._m[0] - term.values[1], 0.02 * self._m[0])
-            case "lag":
-                own = ["u_lag"]
-            case "delay":
-                if term.values[0] < 0.0:
-                    raise DataError(
-                        "the drive leads its log (a negative delay), which no state model can "
-                        "represent; simulate the recordings instead"
-                    )
-                self._delay = _pade(term.values[0])
-                own = [f"u_delay_{q + 1}" for q in range(_PADE_ORDER)]
-        self._built.setdefault(kind, []).append((term, len(self.states)))
-        self.states += own
+    def _moment(self, state: Array, **more: float) -> _Moment:
+        moving = np.reshape(state[: 2 * len(self._names)], (-1, 2)).T.tolist()
+        x, v = (SimpleNamespace(**dict(zip(self._names, part, strict=True))) for part in moving)
+        return _Moment(p=self._p, x=x, v=v, **more)
 
     def start(self, x0: Sequence[float]) -> Array:
         """Return the state of carts (and hidden masses) released at rest at `x0` (n_carts,).
@@ -156,99 +113,79 @@ class EquationsOfMotion:
         Bristles are bent until they hold the carts.
         """
         state = np.zeros(len(self.states))
-        state[: 2 * self.n : 2] = x0
-        for term, at in self._built.get("hidden mass", []):
-            state[at] = x0[term.place - 1]
-        for _, at in self._built.get("play", []):
-            state[at] = x0[0]
-        pull = self._m * self.rate(state, 0.0)[1 : 2 * self.n : 2]
-        for i, force, _, at in self._bristles:
-            state[at] = np.clip(-pull[i] / force(x=state[2 * i], v=0.0, z=1.0), -1.0, 1.0)
+        state[: 2 * len(self._names) : 2] = [x0[body.start] for body in self._model.bodies]
+        now = self._moment(state)
+        pull = self._m * self.rate(state, 0.0)[1 : 2 * len(self._names) : 2]
+        for bristle in self._model.bristles:
+            held = pull[self._names.index(bristle.body)] / now.value(bristle.force, z=1.0)
+            state[self.states.index(bristle.name)] = np.clip(-held, -1.0, 1.0)
         return state
+
+    def readings(self, state: Array) -> list[float]:
+        """Return the readings of the carts' sensors."""
+        now = self._moment(state)
+        return [now.value(reading) for reading in self._model.readings]
 
     def rate(self, state: Array, command: float, *, stop: float = STOP_TIME) -> Array:
         """Return the rate of change of the state under the logged input `command`."""
-        n = self.n
-        x, v = state[: 2 * n : 2], state[1 : 2 * n : 2]
-        out = np.zeros(state.size)
+        d, out = self._model, np.zeros(state.size)
         u = self._arriving(state, command, out)
-        d, rates = (np.diff(np.concatenate([[0.0], a, [0.0]])) for a in (x, v))
-        force, tension = -self._c * v, self._k * d
-        play = self._built.get("play")
-        driven = state[play[0][1]] if play else x[0]
-        push = u
-        for term, law in self._forces:
-            if term.effect.place == "spring":
-                j = term.place - 1
-                tension[j] += law(d=d[j], rate=rates[j], u=u)
-            elif term.effect.place == "cart":
-                i = term.place - 1
-                force[i] += law(x=x[i], v=v[i], u=u)
-            elif isinstance(term.effect.law, effect.ForceLaw) and term.effect.law.on_motor:
-                push += law(x=driven, v=state[play[0][1] + 1] if play else v[0], u=u)
-            else:
-                force[0] += law(x=x[0], v=v[0], u=u, on=float(command != 0.0))
-        for term, law, past, pulls in self._contacts:
-            side, j = 1.0 if past > 0.0 else -1.0, term.place - 1
-            if term.effect.place == "spring":
-                if side * (d[j] - past) > 0.0:
-                    tension[j] += law(d=d[j], rate=rates[j])
-            elif side * (x[j] - past) > 0.0:
-                f = law(x=x[j], v=v[j])
-                force[j] += f if pulls or side * f < 0.0 else 0.0
-        for term, at in self._built.get("hidden mass", []):
-            i, (mass, stiffness, damping) = term.place - 1, term.values
-            f = stiffness * (state[at] - x[i]) + damping * (state[at + 1] - v[i])
-            force[i] += f
-            out[at], out[at + 1] = state[at + 1], -f / mass
-        if play:
-            push = self._across(play[0], state, push, out, x[0], v[0])
-        force[0] += push
-        force += np.diff(tension)
-        for i, law, bend, at in self._bristles:
-            force[i] += law(x=x[i], v=v[i], z=state[at])
-            out[at] = bend(x=x[i], v=v[i], z=state[at])
-        slide = np.zeros(n)
-        for i, law in self._frictions:
-            slide[i] += law(v=v[i], u=u, x=x[i])
-        force -= np.clip(self._m * v / stop, -slide, slide)
-        out[: 2 * n : 2], out[1 : 2 * n : 2] = v, force / self._m
+        now = self._moment(state, u=u, on=float(command != 0.0))
+        force, slide = dict.fromkeys(self._names, 0.0), dict.fromkeys(self._names, 0.0)
+        force[d.driven] += u
+        for part in d.forces:
+            force[part.body] += now.force(part)
+        for spring in d.springs:
+            stretch = {"d": now.value(spring.stretch), "rate": now.value(spring.rate)}
+            tension = sum(now.force(part, **stretch) for part in spring.tension)
+            for body, pull in ((spring.left, tension), (spring.right, -tension)):
+                if body:
+                    force[body] += pull
+        for hidden, part in d.links:
+            pull = now.force(part)
+            force[part.body] += pull
+            force[hidden] -= pull
+        if d.play:
+            push = self._across(now)
+            force["cart_1"] += push
+            force["motor"] -= push
+        for bristle in d.bristles:
+            at = self.states.index(bristle.name)
+            force[bristle.body] += now.value(bristle.force, z=float(state[at]))
+            out[at] = now.value(bristle.rate, z=float(state[at]))
+        for part in d.frictions:
+            slide[part.body] += now.value(part.force)
+        v, most = state[1 : 2 * len(self._names) : 2], np.array([*slide.values()])
+        total = np.array([*force.values()]) - np.clip(self._m * v / stop, -most, most)
+        out[: 2 * v.size : 2], out[1 : 2 * v.size : 2] = v, total / self._m
         return out
 
     def _arriving(self, state: Array, command: float, out: Array) -> float:
         """Return the force of the drive; fill in the rates of the drive's states."""
-        u = command
-        for law in self._inputs:
-            u = law(u=u)
+        u, fixed = command, _Moment(p=self._p)
+        for _, law in self._model.inputs:
+            u = fixed.value(law, u=u)
         if self._delay is not None:
             A, b, c, direct = self._delay
-            at = self._built["delay"][0][1]
+            at = self.states.index("u_delay_1")
             past = state[at : at + _PADE_ORDER]
             out[at : at + _PADE_ORDER] = A @ past + b * u
             u = float(c @ past) + direct * u
-        for term, at in self._built.get("lag", []):
-            out[at] = (u - state[at]) / term.values[0]
+        if self._lag:
+            at = self.states.index("u_lag")
+            out[at] = (u - state[at]) / self._lag
             u = float(state[at])
         return u
 
-    def _across(
-        self,
-        play: tuple[effect.EffectTerm, int],
-        state: Array,
-        push: float,
-        out: Array,
-        x: float,
-        v: float,
-    ) -> float:
-        """Return the force that reaches cart 1 across the backlash; fill in the motor's rates."""
-        (gap, mass, stiffness, damping), at = play[0].values, play[1]
-        apart, rate = state[at] - x, state[at + 1] - v
+    def _across(self, now: _Moment) -> float:
+        """Return the force that reaches cart 1 across the backlash."""
+        assert self._model.play
+        gap, stiffness, damping = map(now.value, self._model.play)
+        apart, rate = now.value("x.motor - x.cart_1"), now.value("v.motor - v.cart_1")
         side = 1.0 if apart > 0.0 else -1.0
         depth = stiffness * (abs(apart) - 0.5 * gap)
         reach = depth + damping * side * rate
-        reach = side * reach if min(depth, reach) > 0.0 else 0.0
-        out[at], out[at + 1] = state[at + 1], (push - reach) / mass
-        return reach
+        return side * reach if min(depth, reach) > 0.0 else 0.0
 
     def to_control(self) -> "control.NonlinearIOSystem":
         """Return the python-control system: input `u`, outputs `x1`, … as the sensors read them.
@@ -262,13 +199,13 @@ class EquationsOfMotion:
             return self.rate(np.asarray(state, dtype=np.float64), float(np.ravel(u)[0]), stop=stop)
 
         def output(t: float, state: Array, u: Array, params: Mapping[str, float]) -> Array:
-            return self.gains * state[: 2 * self.n : 2]
+            return np.array(self.readings(state))
 
         return control.nlsys(
             update,
             output,
             inputs=["u"],
-            outputs=[f"x{i + 1}" for i in range(self.n)],
+            outputs=[f"x{i + 1}" for i in range(self._model.n)],
             states=self.states,
             params={"stop": STOP_TIME},
             name="carts",
