@@ -205,19 +205,12 @@ _FARTHEST = 50.0  # bound of a logarithm, so that a step that goes astray does n
 _ZETA_RANGE = (0.01, 1.0)  # damping ratios allowed at the start; others do not converge
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StagedFit:
-    """Static gains (n,), polynomials T_1 … T_n as in `Chain.tails`, and the named parameters."""
-
-    gains: Array
-    tails: list[Array]
-    parameters: dict[str, float]
-
-
 def fit_stage_by_stage(
     data: Points, *, n: int, initial: Mapping[str, float], like: Chain
-) -> StagedFit:
-    """Fit the transfer functions cart by cart, cart n first.
+) -> tuple[Chain, dict[str, float]]:
+    """Fit the transfer functions cart by cart, cart n first; return the chain and its parameters.
+
+    The stiffnesses of the chain may be negative.
 
     Parameters
     ----------
@@ -233,8 +226,8 @@ def fit_stage_by_stage(
         gains[cart - 1], factors[i] = _fit(
             data, gains[cart - 1], factors[i], cart=cart, denominator=factors[0] if i else None
         )
-    tails = [_polynomial(factor) for factor in factors]
-    return StagedFit(gains=gains, tails=tails, parameters=_named(gains, factors, tails))
+    found = recover_chain(gains, [_polynomial(factor) for factor in factors]).chain()
+    return found, _named(gains, factors, found)
 
 
 def _start(known: Mapping[str, float], i: int, *, n: int, like: Chain) -> Array:
@@ -304,8 +297,8 @@ def _polynomial(factors: Array) -> Array:
     return product.astype(np.float64)
 
 
-def _named(gains: Array, factors: list[Array], tails: list[Array]) -> dict[str, float]:
-    """Return the fitted values by name, and the carts' own frequencies computed from them.
+def _named(gains: Array, factors: list[Array], found: Chain) -> dict[str, float]:
+    """Return the fitted values by name, and the frequencies of single carts of the chain.
 
     A frequency that does not exist is left out.
     """
@@ -316,7 +309,6 @@ def _named(gains: Array, factors: list[Array], tails: list[Array]) -> dict[str, 
         for suffix, omega, zeta in zip(_suffixes(i, n=n), *np.exp(factor[:, order]), strict=False):
             values[f"omega_{suffix}"] = float(omega)
             values[names.mode_zeta(suffix)] = float(zeta)
-    found = recover_chain(gains, tails)
     for i in range(1, n if n > 1 else 0):
         stiffness = found.k[i - 1] + found.k[i]
         if stiffness > 0 and found.m[i - 1] > 0:
@@ -387,7 +379,7 @@ def fit_bode(
         staged, first = _staged_start(data, known, bench=bench, like=like)
         starts = itertools.chain([first], _random_starts(like, bench=bench))
     else:
-        staged, starts = None, (physical_start(near, bench=bench),)
+        staged, starts = {}, (physical_start(near, bench=bench),)
     best, tried = _fit_from_starts(P, data, starts)
     best, remark = _fit_phases(best, data)
     best, share = _widen(best, data)
@@ -422,13 +414,12 @@ def _stand_in(data: Points, known: Mapping[str, float], *, bench: Setup) -> Chai
 
 def _staged_start(
     data: Points, known: Mapping[str, float], *, bench: Setup, like: Chain
-) -> tuple[StagedFit | None, Chain]:
-    """Fit stage by stage; return this fit and its chain, corrected to be physically possible."""
+) -> tuple[dict[str, float], Chain]:
+    """Return the parameters of the fit stage by stage, and a possible chain near its chain."""
     if not any(bench.springs):
-        return None, like
-    staged = fit_stage_by_stage(data, n=bench.n, initial=known, like=like)
-    implied = recover_chain(staged.gains, staged.tails).chain()
-    return staged, physical_start(implied, bench=bench)
+        return {}, like
+    found, staged = fit_stage_by_stage(data, n=bench.n, initial=known, like=like)
+    return staged, physical_start(found, bench=bench)
 
 
 def _random_starts(like: Chain, *, bench: Setup) -> Iterator[Chain]:
@@ -616,7 +607,7 @@ def _result(
     data: Points,
     *,
     share: float,
-    staged: StagedFit | None,
+    staged: dict[str, float],
     tried: int,
     remark: str,
 ) -> ChainFit:
@@ -654,7 +645,7 @@ def _result(
         covariance=covariance,
         at_bound=(*P.zero, *dampers),
         parameters=parameters,
-        staged=staged.parameters if staged else {},
+        staged=staged,
         chi_square_per_dof=chi_square_per_dof,
         dof=fitted.dof,
         n_points=data.size,

@@ -16,7 +16,7 @@ from pipeline.gap.parameters import (
     fresh_nuisance,
     simulate_run,
 )
-from pipeline.gap.runs import GapRun, prepare
+from pipeline.gap.runs import GapRun
 from pipeline.plant.augmented import rest_positions, simulate_augmented
 from pipeline.plant.effect import AugmentedChain
 from pipeline.results import HardwareCheck, Record
@@ -73,16 +73,6 @@ def replay_driven(
         rest_of_cart = float(run.rest[row])
         replays.append(Replay(check=check, model=chosen[row], nrmse=error, rest=rest_of_cart))
     return replays
-
-
-def prepare_run(record: Record, *, springs: tuple[bool, ...]) -> GapRun:
-    """Return one record as the fits of the gap use it; a decay starts after the hand has let go.
-
-    Raises
-    ------
-    DataError : the record is too short, or no free cart moves.
-    """
-    return prepare([record], springs=springs, notes=[])[0]
 
 
 def replay_fitted(run: GapRun, model: AugmentedChain, *, springs: tuple[bool, ...]) -> Array:

@@ -14,8 +14,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.hardware_check import check_hardware, released_run
-from pipeline.gap.replay import Replay, prepare_run, replay_driven, replay_fitted
-from pipeline.gap.runs import GapRun
+from pipeline.gap.replay import Replay, replay_driven, replay_fitted
+from pipeline.gap.runs import GapRun, prepare
 from pipeline.gap.types import Gap
 from pipeline.plant.chain import Chain
 from pipeline.results import Analysis, ExperimentKind, HardwareCheck, Record
@@ -162,7 +162,7 @@ def _with_effects(
     measured = {one.check.cart: one.check.measured for one in replays}
     if record.kind != "closed_loop" and replays:
         with suppress(DataError):
-            run = prepare_run(record, springs=springs)
+            run = prepare([record], springs=springs, notes=[])[0]
             readings = replay_fitted(run, gap.model, springs=springs)
             carts = [row + 1 for row in run.rows]
             fitted = {**found, **dict(zip(carts, readings, strict=True))}
@@ -195,7 +195,7 @@ def _released(
 ) -> tuple[dict[int, list[Simulated]], str]:
     """Return the simulations of each cart in a decay from the moment of release, and a note."""
     springs = analysis.bench.springs
-    run = prepare_run(record, springs=springs)
+    run = prepare([record], springs=springs, notes=[])[0]
     linear = released_run(_motion_alone(run), chain)
     y = linear.unforced() + (linear.forced() if linear.driven else 0.0)
     rest = dict(zip(linear.free, linear.rest, strict=True))
