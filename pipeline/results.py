@@ -145,6 +145,16 @@ class Record:
         if any(a is not None and a.shape != (n,) for a in (self.u, self.reference)):
             raise ValueError(f"{self.id}: the input or reference does not match t ({n},)")
 
+    @property
+    def measured_free(self) -> tuple[int, ...]:
+        """The free carts that were measured, in the order of the rows of y."""
+        return tuple(cart for cart in self.carts if cart in self.free)
+
+    def part(self, samples: slice) -> "Record":
+        """Return the record with only some of its samples."""
+        u, reference = (None if a is None else a[samples] for a in (self.u, self.reference))
+        return replace(self, t=self.t[samples], u=u, y=self.y[:, samples], reference=reference)
+
     def position(self, cart: int) -> Array:
         """Return the measured position (n,) of one cart."""
         return self.y[self.carts.index(cart)]

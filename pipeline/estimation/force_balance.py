@@ -404,7 +404,7 @@ def _found_in(records: tuple[Record, ...]) -> tuple[Intervention, ...]:
     open_loop = [record for record in records if record.kind not in ("closed_loop", "bode")]
     first = {record.id: _first_copy(record, open_loop) for record in open_loop}
     alone = [record for record in open_loop if first[record.id] == record.id]
-    carts = sorted({cart for r in alone for cart in r.free if cart in r.carts})
+    carts = sorted({cart for record in alone for cart in record.measured_free})
     seen = [WindowMeans(record) for record in alone if record.t.size > _width(record)]
     bursts = [one for cart in carts for one in _bursts(cart, seen)]
     found = [
@@ -438,21 +438,11 @@ def between(record: Record, interventions: Sequence[Intervention]) -> list[Recor
             touched |= (record.t >= one.start) & (record.t <= one.end)
     if not touched.any():
         return [record]
-    pieces = []
-    for first, last in _runs(~touched):
-        if record.t[last] - record.t[first] < _GAP:
-            continue
-        part = slice(first, last + 1)
-        pieces.append(
-            replace(
-                record,
-                t=record.t[part],
-                u=None if record.u is None else record.u[part],
-                y=record.y[:, part],
-                reference=None if record.reference is None else record.reference[part],
-            )
-        )
-    return pieces
+    return [
+        record.part(slice(first, last + 1))
+        for first, last in _runs(~touched)
+        if record.t[last] - record.t[first] >= _GAP
+    ]
 
 
 def _bursts(cart: int, seen: Sequence[WindowMeans]) -> list[Intervention]:

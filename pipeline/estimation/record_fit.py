@@ -93,11 +93,6 @@ def is_driven(record: Record) -> bool:
     return driven and record.u is not None and bool(np.ptp(record.u) > 0)
 
 
-def measured(record: Record) -> list[int]:
-    """Return the free carts that were measured."""
-    return [cart for cart in record.carts if cart in record.free]
-
-
 def record_fits(records: Sequence[Record], chain: Chain) -> dict[str, RecordFit]:
     """Return, by id, how well each driven record follows the chain.
 
@@ -156,7 +151,7 @@ def find_correction(
 
 
 def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Correction, Record]]:
-    for i, j in combinations(measured(record), 2):
+    for i, j in combinations(record.measured_free, 2):
         rows = list(range(len(record.carts)))
         a, b = record.carts.index(i), record.carts.index(j)
         rows[a], rows[b] = b, a

@@ -191,7 +191,7 @@ def open_window(record: Record) -> FitWindow:
     DataError : no free cart was measured, a cart stands still (it sticks, or its encoder is dead),
         or too few samples are usable.
     """
-    carts = tuple(cart for cart in record.carts if cart in record.free)
+    carts = record.measured_free
     used = usable_segment(record)
     t, y = record.t[used], np.array([record.position(cart)[used] for cart in carts])
     if not carts or t.size < _FEWEST_SAMPLES:

@@ -209,7 +209,7 @@ def make_run(record: Record, *, n: int, part_of: Record | None = None) -> GapRun
     the hand has let go; earlier samples are cut.
     """
     in_motion = part_of is not None
-    rows = tuple(cart - 1 for cart in record.carts if cart in record.free)
+    rows = tuple(cart - 1 for cart in record.measured_free)
     y = np.array([record.position(row + 1) for row in rows])
     resolution = np.array([record.encoder_step(row + 1) for row in rows])
     guided = _guided(record, n=n)
@@ -543,8 +543,8 @@ def _is_usable(record: Record) -> bool:
 
 
 def _moves(record: Record) -> bool:
-    moving = (c for c in record.carts if c in record.free)
-    return any(_span(record, c) > _LEAST_MOTION * record.encoder_step(c) for c in moving)
+    far = (_span(record, c) > _LEAST_MOTION * record.encoder_step(c) for c in record.measured_free)
+    return any(far)
 
 
 def _span(record: Record, cart: int) -> float:
@@ -553,7 +553,7 @@ def _span(record: Record, cart: int) -> float:
 
 def _with_still_carts_held(records: list[Record], *, notes: list[str]) -> list[Record]:
     """Return the records in which carts that never move are marked as held."""
-    seen = [(r, cart) for r in records for cart in r.free if cart in r.carts]
+    seen = [(r, cart) for r in records for cart in r.measured_free]
     # A cart whose readings stay within three encoder steps is at rest.
     moving = {cart for r, cart in seen if _span(r, cart) > 3.0 * r.encoder_step(cart)}
     still = {cart for _, cart in seen} - moving
@@ -573,18 +573,12 @@ def split_holdout(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun]
     longest = max(range(len(runs)), key=lambda i: runs[i].t[-1] - runs[i].t[0])
     run = runs[longest]
     cut = int((1.0 - 0.4) * _last_motion(run))  # the last 40 % of the motion is held out
-    pieces = []
+    pieces, used = [], run.record.part(slice(-run.t.size, None))
     for piece in (slice(0, cut), slice(cut, None)):
-        record = replace(
-            run.record,
-            # No hand acts in the later piece of a decay.
-            kind=run.record.kind if piece.start == 0 and run.record.kind != "decay" else "sweep",
-            t=run.t[piece],
-            u=None if run.record.u is None else run.record.u[-run.t.size :][piece],
-            y=np.array([run.record.y[j][-run.t.size :][piece] for j in range(len(run.record.y))]),
-            reference=None,
-        )
-        starts = piece.start == 0 and run.record.kind != "decay"
+        starts = piece.start == 0 and used.kind != "decay"
+        # No hand acts in the later piece of a decay.
+        kind = used.kind if starts else "sweep"
+        record = replace(used.part(piece), kind=kind, reference=None)
         part = make_run(record, n=run.zero.size, part_of=None if starts else run.record)
         pieces.append(
             replace(

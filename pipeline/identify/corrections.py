@@ -26,7 +26,6 @@ from pipeline.estimation.record_fit import (
     fit_detuned,
     force_on,
     is_driven,
-    measured,
     most_are_consistent,
 )
 from pipeline.estimation.time_fit import FOLLOWED
@@ -145,7 +144,9 @@ def standing_still(records: Sequence[Record]) -> set[str]:
         record.id
         for record in records
         if is_driven(record)
-        and any(_is_noise(record, cart) or any(_still(record, cart)) for cart in measured(record))
+        and any(
+            _is_noise(record, cart) or any(_still(record, cart)) for cart in record.measured_free
+        )
     }
 
 
@@ -167,7 +168,7 @@ def find_faults(
     steps: dict[int, float] = {}  # the largest of all records, as a dead channel shows no step
     moving: set[int] = set()
     for record in records:
-        for cart in measured(record):
+        for cart in record.measured_free:
             steps[cart] = max(steps.get(cart, 0.0), record.encoder_step(cart))
             y = record.position(cart)
             if is_driven(record) and np.ptp(y) > 0 and not _is_noise(record, cart):
@@ -259,7 +260,7 @@ def _dead_channels(
     the records allow, and `steps` the encoder step. `moving` are the carts that any input ever
     moved.
     """
-    for record, cart in ((r, cart) for r in records for cart in measured(r)):
+    for record, cart in ((r, cart) for r in records for cart in r.measured_free):
         y, run, driven = record.position(cart), record.id, is_driven(record)
         noise = _is_noise(record, cart)
         if noise and (record.kind == "decay" or cart not in moving):

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.estimation.force_balance import find_channel_delays, without_releases
-from pipeline.estimation.record_fit import LENGTH_SCALES, TIME_UNITS, measured
+from pipeline.estimation.record_fit import LENGTH_SCALES, TIME_UNITS
 from pipeline.identify.findings import (
     SAME,
     WITNESSES,
@@ -83,7 +83,7 @@ def _swings(record: Record) -> tuple[float, dict[int, float]]:
     If no free cart was measured, the held ones are left out.
     """
     swing = {cart: float(np.ptp(record.position(cart))) for cart in record.carts}
-    free = [swing.pop(cart) for cart in record.carts if cart in record.free]
+    free = [swing.pop(cart) for cart in record.measured_free]
     return (max(free), swing) if free else (0.0, {})
 
 
@@ -272,7 +272,7 @@ def _stuck(records: Sequence[Record]) -> Iterator[Finding]:
     when it changes again.
     """
     for record in records:
-        for cart in measured(record):
+        for cart in record.measured_free:
             y = record.position(cart)
             for first, last in stuck_spans(y):
                 moves = np.abs(np.diff(y))

@@ -110,7 +110,6 @@ def _compare(record: Record, analysis: Analysis, gap: Gap | None) -> ComparedRun
                 models, note = _driven(record, analysis, analysis.chain, gap)
         except DataError as error:
             note = _WORDS.text("no_model", reason=str(error).removeprefix(f"{record.id}: "))
-    carts = [cart for cart in record.carts if cart in record.free]
     return ComparedRun(
         id=record.id,
         kind=record.kind,
@@ -120,7 +119,7 @@ def _compare(record: Record, analysis: Analysis, gap: Gap | None) -> ComparedRun
             ComparedCart(
                 cart=cart, measured=record.position(cart), models=tuple(models.get(cart, ()))
             )
-            for cart in carts
+            for cart in record.measured_free
         ),
         note=note,
     )
@@ -196,7 +195,8 @@ def _released(
     """Return the simulations of each cart in a decay from the moment of release, and a note."""
     springs = analysis.bench.springs
     run = prepare([record], springs=springs, notes=[])[0]
-    linear = released_run(_motion_alone(run), chain)
+    motion = replace(run.record.part(slice(-run.t.size, None)), reference=None)
+    linear = released_run(motion, chain)
     y = linear.unforced() + (linear.forced() if linear.driven else 0.0)
     rest = dict(zip(linear.free, linear.rest, strict=True))
     rows = {cart: y[linear.free.index(cart)] for cart in (row + 1 for row in run.rows)}
@@ -210,18 +210,6 @@ def _released(
         except DataError:
             note = _WORDS.text("effects_run_away")
     return dict(_from_release(run, record, models, rest)), note
-
-
-def _motion_alone(run: GapRun) -> Record:
-    """Return the record without the samples before the run."""
-    record, n = run.record, run.t.size
-    return replace(
-        record,
-        t=record.t[-n:],
-        u=None if record.u is None else record.u[-n:],
-        y=record.y[:, -n:],
-        reference=None,
-    )
 
 
 def _from_release(
