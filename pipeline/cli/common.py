@@ -31,7 +31,7 @@ from pipeline.words.progress import Progress
 # `cartlab --help` lists the commands by role, in this order; the others are under MORE.
 ROLES = {
     "Students": ("fill", "inspect", "report", "check", "gap", "desk"),
-    "TAs": ("grade", "override", "adjust", "history", "export", "check-rubric"),
+    "TAs": ("grade", "override", "adjust", "hold", "history", "export", "check-rubric"),
     "Instructors": ("new", "plan", "acquire", "explore", "simulate", "solution"),
 }
 MORE = "More"

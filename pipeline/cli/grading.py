@@ -230,6 +230,27 @@ def adjust(
         name, read_points(points) or 0.0, why=why, by=by))  # fmt: skip
 
 
+@app.command()
+def hold(
+    grades: Grades,
+    team: Team,
+    by: Annotated[str, typer.Option(metavar="NAME", help="Who decides.")],
+    why: Annotated[str, typer.Option(help="The reason, for the staff.")] = "",
+    end: Annotated[bool, typer.Option("--end", help="Hold it back no longer.")] = False,
+    assignment: Lab = None,
+) -> None:
+    """Hold a team's grade back from students and exports; or, with --end, no longer."""
+    from pipeline.grading.publish.pseudonyms import resolve_pseudonym
+
+    with _changing(grades, assignment) as book:
+        name = resolve_pseudonym(book, team)
+        if end:
+            book.let_go(name, by=by)
+        else:
+            book.hold(name, why=why, by=by)
+    say(f"{team}: {'no longer ' if end else ''}held back")
+
+
 def _change(
     grades: str,
     team: str,

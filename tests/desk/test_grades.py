@@ -842,3 +842,40 @@ def test_undoing_a_decision_keeps_later_changes(ta, grades):
     given = {name: overrides(grades, name) for name in names}
     reasons = {name: own["laws"].text for name, own in given.items() if own}
     assert reasons == {names[0]: "right after all"}
+
+
+def test_a_grade_is_held_back_and_let_go(ta, grades):
+    """The team's page holds a grade back with a reason, and says so; the class can list these."""
+    refused = ta.post(at("team-02"), do="hold", why="")
+    assert refused.status == 303
+    ta.post(at("team-02"), do="hold", why="a case")
+    assert 'id="held"' in ta.get(at("team-02")).text
+    assert names(ta.get(f"{ROOM}?state=held")) == ["team-02"]
+    with Gradebook(grades) as book:
+        assert book.entry("team-02").hold.by == "Ada"
+    ta.post(at("team-02"), do="let_go")
+    assert names(ta.get(f"{ROOM}?state=held")) == []
+
+
+def test_publishing_holds_open_cases_back(ta, grades):
+    """Teams with shared recordings that nobody reviewed are held back, until somebody decides."""
+    ta.post(at("team-03"), do="accept")
+    ta.post(f"{ROOM}release", do="release")
+    assert names(ta.get(f"{ROOM}?state=held")) == ["team-02"]
+
+
+def test_one_criterion_is_graded_for_one_team_after_another(ta):
+    """With a criterion chosen, each team's page shows it, and saving leads to the next team."""
+    walk = {"by": "laws", "order": "name"}
+    first, second = names(ta.get(f"{ROOM}?{urlencode(walk)}"))[:2]
+    page = ta.get(at(first, **walk))
+    assert page.value("criterion") == "laws"
+    saved = ta.post(
+        at(first, **walk), do="change", criterion="laws", points="0.5", why="half",
+        seen=page.value("seen"),
+    )  # fmt: skip
+    assert saved.status == 303
+    after = saved.headers["location"]
+    assert f"of={second}" in after
+    assert "by=laws" in after
+    assert ta.get(after).value("criterion") == "laws"

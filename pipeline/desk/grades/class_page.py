@@ -84,6 +84,7 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
         points=points_text,
         found=len(chosen),
         total=len(shown.teams),
+        held=sum(bool(team.hold) for team in shown.teams.values()),
         failed=sum(team.grade.status == "failed" for team in shown.teams.values()),
         not_final=not_final([team.grade for team in shown.teams.values()]),
         words=WORDS,
@@ -232,6 +233,7 @@ def show_class_page(ask: PageRequest) -> Response:
             repeated_authors=doubles,
             clusters=clusters,
             distant=find_distant(numbers),
+            held=[name for name, team in shown.teams.items() if team.hold],
         )
 
     return show_own_page(ask.desk.gradebooks.drawn(ask.place_or_404(), "class", draw))
@@ -290,8 +292,10 @@ def release(ask: PageRequest) -> Response:
             403, "only the instructor decides when students can read their feedback"
         )
     released = ask.text("do") == "release"
-    ask.gradebook.release(released, by=ask.sign())
+    held = ask.gradebook.release(released, by=ask.sign())
     message = "The grades are published." if released else "The grades are no longer published."
+    if held:
+        message += f" {count(len(held), 'team')} with shared recordings held back: review them."
     return ask.back(f"{ask.here}#work", message)
 
 

@@ -15,6 +15,7 @@ _STATES: Mapping[str, tuple[str, Callable[[Entry], bool]]] = {
     "late": ("late", lambda team: team.grade.days_late > 0),
     "hand": ("changed by hand", lambda team: bool(team.grade.by_hand)),
     "open": ("not final", lambda team: bool(team.grade.open)),
+    "held": ("held back", lambda team: bool(team.hold)),
     "remark": ("with a flag", lambda team: bool(team.grade.codes)),
 }
 _SEEN = {"no": "not yet reviewed", "yes": "reviewed"}
@@ -38,6 +39,7 @@ class Filter:
     state : only teams in one of the `_STATES`.
     seen : only reviewed teams ("yes"), or only teams not yet reviewed ("no").
     q : only teams with this text in their name or authors.
+    by : criterion that the pages of all teams show first, to grade it for one team after another.
     order : one of the `_ORDERS`; "" shows what is still to review first, doubts before the rest,
         and there those with the fewest points.
     """
@@ -48,6 +50,7 @@ class Filter:
     state: str = ""
     seen: str = ""
     q: str = ""
+    by: str = ""
     order: str = ""
 
     @classmethod
@@ -129,6 +132,7 @@ class Filter:
             _choice("seen", "Looked at", {k: f"{_SEEN[k]} ({n})" for k, n in numbers.items()},
                     self.seen),
             _choice("order", "Order", _ORDERS, self.order, whole=False),
+            _choice("by", "Grade", {"": "whole teams", **titles}, self.by, whole=False),
         ]  # fmt: skip
 
 

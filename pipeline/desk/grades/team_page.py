@@ -105,7 +105,14 @@ def act(ask: PageRequest) -> Response:
         book.remove([name])
         text = f"{team.grade.submission}: no longer in the class. Its history stays."
         return ask.back(ask.here, text)
-    if what in ("sign", "unsee"):
+    try:
+        if what == "hold":
+            book.hold(name, why=ask.text("why"), by=by)
+        if what == "let_go" and may_release(ask):
+            book.let_go(name, by=by)
+    except ConfigError as error:
+        return ask.back(write_address(ask, team.grade.submission), f"{capital(str(error))}.")
+    if what in ("sign", "unsee", "hold", "let_go"):
         return ask.back(write_address(ask, team.grade.submission))
     if what == "accept":
         seen = ask.text("version") or team.whole_version
@@ -139,6 +146,11 @@ def act(ask: PageRequest) -> Response:
         return ask.back(
             f"{write_address(ask, team.grade.submission)}#total", "Saved.", place=_TOTAL
         )
+    wanted = Filter.read(ask.request.query_params)
+    if what == "change" and criterion == wanted.by:
+        after = wanted.beside(shown, team.grade.submission)[1]
+        to = write_address(ask, after) if after else f"{ask.here}?{wanted.query}"
+        return ask.back(to, f"{team.grade.submission}: saved.")
     to = write_address(ask, team.grade.submission, criterion=criterion)
     done = "Undone." if what == "undo" else "Saved."
     return ask.back(f"{to}#chosen", done, place=_POINTS)
@@ -237,6 +249,9 @@ def _show_page(
         seen=team.reviewed_by,
         whole_version=team.whole_version,
         may_remove=may_remove(ask, team),
+        hold=team.hold,
+        may_let_go=may_release(ask),
+        by=wanted.by,
         items=_link_items(ask, name, items, chosen),
         doubts=sum(item.doubt for item in items),
         events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
@@ -272,6 +287,7 @@ def _find_chosen(ask: PageRequest, items: Sequence[Item], rubric: Rubric) -> Ite
     Without a name, return the first row that is in doubt or has a figure.
     """
     criterion = ask.text("criterion") or ask.query("criterion")
+    criterion = criterion or ("" if ask.query("remark") else ask.query("by"))
     for wanted, is_remark in ((criterion, False), (ask.query("remark"), True)):
         for item in items:
             if wanted == item.id and is_remark == item.is_remark:

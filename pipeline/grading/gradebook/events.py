@@ -19,6 +19,7 @@ from pipeline.grading.total import with_total
 TOTAL = "(total)"
 POINTS = ("override", "comment", "adjusted")
 REQUESTS = ("asked", "answered", "reopened")
+HOLDS = ("held", "let_go")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +30,8 @@ class Event:
     `comment` leaves the automatic points. `adjusted` adds points to the total; they may be
     negative. `asked`, `answered` and `reopened` belong to a student's request to review a
     criterion. `reviewed` marks a grading as reviewed, and `unreviewed` takes the mark back.
-    `released` lets students read the feedback of the class, and `hidden` hides it.
+    `held` holds the grade of one submission back from students and exports, and `let_go` ends
+    this. `released` lets students read the feedback of the class, and `hidden` hides it.
 
     The history also has events of the grader. `graded` is a grading by the rubric alone. `listed`
     is a new or changed line of a class list, with shared data and points by hand. `removed` is the
@@ -51,7 +53,7 @@ class Event:
 
     what: Literal[
         "override", "comment", "adjusted", "asked", "answered", "reopened", "reviewed",
-        "unreviewed", "released", "hidden", "graded", "listed", "removed",
+        "unreviewed", "held", "let_go", "released", "hidden", "graded", "listed", "removed",
         "dropped", "restored",
     ]  # fmt: skip
     criterion: str = ""
@@ -250,6 +252,18 @@ class Entry:
             if event.what in REQUESTS:
                 asked.setdefault(event.criterion, []).append(event)
         return {id_: Request(criterion=id_, events=tuple(own)) for id_, own in asked.items()}
+
+    @property
+    def hold(self) -> Event | None:
+        """The event that holds the grade back; None if nothing does."""
+        last = next((event for event in reversed(self.events) if event.what in HOLDS), None)
+        return last if last and last.what == "held" else None
+
+    @property
+    def has_open_case(self) -> bool:
+        """Whether recordings are shared, and nobody reviewed this or decided on the grade."""
+        decided = self.reviewed_by or any(event.what in HOLDS for event in self.events)
+        return "shared_data" in self.graded.codes and not decided
 
     @property
     def reviewed_by(self) -> str:

@@ -76,6 +76,7 @@ State = tuple[int, int, int]
 
 _SUGGESTED = 4  # names of submissions in one suggestion
 _MOST_SHOWN = 50  # requests of each kind on one page
+_OPEN_CASE = "recordings or numbers are shared with another team; nobody has reviewed this yet"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -677,11 +678,50 @@ class Gradebook:
         with self._database.reading() as connection:
             return is_released(connection, self._last(connection).assignment)
 
-    def release(self, released: bool, *, by: str) -> None:
-        """Let students read the feedback of the class, or hide it again."""
+    def release(self, released: bool, *, by: str) -> list[str]:
+        """Let students read the feedback of the class, or hide it again.
+
+        A release holds back the submissions with an open case, and returns their names.
+        """
         with self._database.changing() as connection:
-            event = Event(what="released" if released else "hidden", by=by, at=self._at())
-            add_event(connection, event, assignment=self._last(connection).assignment)
+            last, at = self._last(connection), self._at()
+            class_now = read_class(connection, last, None).entries if released else []
+            open_ = [entry.submission for entry in class_now if entry.has_open_case]
+            for row, _ in self._named(connection, open_).values():
+                self._store(connection, row, [Event(what="held", text=_OPEN_CASE)], by=by, at=at)
+            event = Event(what="released" if released else "hidden", by=by, at=at)
+            add_event(connection, event, assignment=last.assignment)
+        return open_
+
+    def hold(self, team: str, *, why: str, by: str) -> None:
+        """Hold a submission's grade back: no student reads it, and no export has it.
+
+        Raises
+        ------
+        ConfigError : there is no reason, or it is held back already.
+        """
+
+        def decide(entry: Entry) -> list[Event]:
+            if entry.hold or not why.strip():
+                raise ConfigError("it is held back already" if entry.hold else "give a reason")
+            return [Event(what="held", text=why.strip())]
+
+        self._decide(team, decide, by=by)
+
+    def let_go(self, team: str, *, by: str) -> None:
+        """Hold a submission's grade back no longer.
+
+        Raises
+        ------
+        ConfigError : it is not held back.
+        """
+
+        def decide(entry: Entry) -> list[Event]:
+            if not entry.hold:
+                raise ConfigError("it is not held back")
+            return [Event(what="let_go")]
+
+        self._decide(team, decide, by=by)
 
     def n_waiting(self) -> int:
         """Return the number of requests of the class that wait for an answer."""
@@ -710,6 +750,8 @@ class Gradebook:
     def own_feedback(self, submission: str, *, assignment: str = "") -> Entry | None:
         """Return what the authors of a submission may read; None until the feedback is released.
 
+        It is None too while the grade is held back.
+
         Parameters
         ----------
         submission : exact name of the submission; the name of an author is not accepted.
@@ -723,7 +765,8 @@ class Gradebook:
         with self._database.reading() as connection:
             if not self._is_readable(connection, assignment):
                 return None
-            return self._entry(connection, submission, exact=True)
+            entry = self._entry(connection, submission, exact=True)
+            return None if entry.hold else entry
 
     def ask(
         self, submission: str, criterion: str, *, why: str, by: str, assignment: str = ""
@@ -801,6 +844,8 @@ class Gradebook:
             if released is not None and not self._is_readable(connection, released):
                 raise RequestRefused("the feedback is not released to students")
             row, entry = self._found(connection, team, exact=released is not None)
+            if released is not None and entry.hold:
+                raise RequestRefused("the feedback is not released to students")
             return self._store(connection, row, decide(entry), by=by, at=self._at())
 
     def _store(

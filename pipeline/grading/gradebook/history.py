@@ -13,6 +13,7 @@ from sqlalchemy import Connection, and_, select
 
 from pipeline.grading.grade import read_grade
 from pipeline.grading.gradebook.events import (
+    HOLDS,
     POINTS,
     REQUESTS,
     TOTAL,
@@ -27,6 +28,7 @@ from pipeline.grading.words import on_one_line, points_text
 from pipeline.submission.load import NAME
 
 _FAILED = "could not be graded: "  # precedes the reason in the text of an event
+_TOLD = (*POINTS, *REQUESTS, *HOLDS)
 _SHOWN = ("at", "what", "points", "out_of", "criterion", "text", "by")
 
 
@@ -44,7 +46,11 @@ def read_history(
     done = read_events(connection, events.c.submission_id == submission).get(submission, ())
     found = [
         *_graded(connection, submission),
-        *(_shown(event, named=named) for event in done if event.what in POINTS + REQUESTS),
+        *(
+            _shown(event, named=named)
+            for event in done
+            if event.what in (*POINTS, *REQUESTS, *HOLDS)
+        ),
         *_listed(connection, submission, named=named),
         *_passed(connection, submission, [event for event in done if event.what in POINTS]),
     ]
@@ -221,6 +227,9 @@ def event_words(event: Event) -> str:
         return f"dropped   given to earlier authors, no longer counts: {event.text}"
     if event.what == "restored":
         return f"restored  given to these authors, counts again: {event.text}"
+    if event.what in HOLDS:
+        what = "held back" if event.what == "held" else "let go"
+        return f"{what:8}  by {event.by}" + (f": {event.text}" if event.text else "")
     if event.what in ("asked", "answered", "reopened"):
         return _request_words(event)
     note = f"  ({event.text})" if event.text else ""

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 from urllib.parse import quote
@@ -48,8 +48,15 @@ def class_page(
     repeated_authors: Sequence[RepeatedAuthors] = (),
     clusters: Sequence[Cluster] = (),
     distant: Sequence[Distant] = (),
+    held: Collection[str] = (),
 ) -> str:
-    """Return `class.html`; the same class gives the same bytes."""
+    """Return `class.html`; the same class gives the same bytes.
+
+    Parameters
+    ----------
+    held : submissions whose grades are held back; only their names are on the page.
+    """
+    grades = [grade for grade in grades if grade.submission not in held]
     frame = class_frame(grades, rubric=rubric)
     graded = frame.loc[frame["status"] == "graded"]
     points = graded.drop_duplicates("submission").loc[:, "total"]
@@ -61,6 +68,7 @@ def class_page(
                 *_board(grades, points, rubric),
                 *_points(page, points, rubric),
                 *_to_look_at(grades, repeated_authors, distant),
+                *_held_back(held),
             ],
         ),
         ("mistakes", "Most common mistakes", lambda page: _mistakes(page, grades)),
@@ -126,6 +134,12 @@ def _to_look_at(
         others = bullet_list(spans(_link(one.submission), f": {one}.") for one in distant)
         blocks += [paragraph(WORDS.text("distant")), others]
     return blocks
+
+
+def _held_back(held: Collection[str]) -> list[Block]:
+    if not held:
+        return []
+    return [paragraph(f"Held back, so without points here: {listing(sorted(held))}.")]
 
 
 def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:

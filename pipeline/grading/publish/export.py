@@ -64,14 +64,14 @@ def export(
     folder = table.parent if table else named_folder(out)
     rubric = book.rubric
     title = title or rubric.title or "cartlab"
-    entries = list(book.entries())
+    entries, held = _without_held(book)
     students, remarks = students_of(entries, platform=platform)
     left = "left as it was" if roster else "left blank"
     if platform.has_results:  # "required if not on each test case" (Gradescope's specification)
         left += f" in {platform.name}.csv, but 0 in results.json, where a score is required"
     ungraded = (s.grade.submission for s in students if not (s.points or s.undecided))
     remarks += about(f"could not be graded, {left}", ungraded)
-    remarks += _not_final(entries)
+    remarks += [*_not_final(entries), *_say_held(held)]
     if not platform.takes_more:
         above = [e for e in entries if e.grade.points > rubric.out_of]
         remarks += about(
@@ -104,8 +104,19 @@ def export(
     files = [table or folder / f"{platform.name}.csv"]
     write_file(files[0], text)
     if platform.has_results and not table:
-        files += _write_results(entries, own_folder(folder, platform.name))
+        files += _write_results(entries, own_folder(folder, platform.name), held=held)
     return Exported(files=tuple(files), remarks=tuple(remarks))
+
+
+def _without_held(book: Gradebook) -> tuple[list[Entry], list[str]]:
+    """Return the class list without grades that are held back, and the names of these."""
+    every = list(book.entries())
+    held = [entry.submission for entry in every if entry.hold]
+    return [entry for entry in every if not entry.hold], held
+
+
+def _say_held(held: Sequence[str]) -> list[Remark]:
+    return about("held back, so not exported", held)
 
 
 def _not_final(entries: Sequence[Entry]) -> list[Remark]:
@@ -213,7 +224,9 @@ def _clock(days: float) -> str:
     return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
 
-def _write_results(entries: Iterable[Entry], folder: Path) -> list[Path]:
+def _write_results(entries: Iterable[Entry], folder: Path, *, held: Sequence[str]) -> list[Path]:
+    for name in held:  # an earlier export may have written it
+        (folder / name / "results.json").unlink(missing_ok=True)
     files = []
     for entry in entries:
         own = own_folder(folder, entry.submission)
@@ -248,11 +261,12 @@ def export_feedback(
         raise ConfigError(f"{platform.title} takes no zip of feedback files: give --lms {takers}")
     named = out.suffix.lower() == ".zip" and not out.is_dir()
     file = out if named else named_folder(out) / _zip_name(platform)
-    entries = {entry.submission: entry for entry in book.entries()}
+    exported, held = _without_held(book)
+    entries = {entry.submission: entry for entry in exported}
     waiting = [name for name, entry in entries.items() if entry.grade.awaits_grading]
     ready = [entry for name, entry in entries.items() if name not in waiting]
     students, remarks = students_of(ready, platform=platform, accounts=True)
-    remarks += _not_final(ready) + about("not graded yet, so left out", waiting)
+    remarks += _not_final(ready) + about("not graded yet, so left out", waiting) + _say_held(held)
     if roster:
         students = Roster.read(roster, platform=platform).identify(students)
     placed, problems = _place(students, platform, has_roster=roster is not None)

@@ -5,7 +5,7 @@ The files depend only on the gradebook. Writing them again gives the same files.
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,7 +47,7 @@ def write_outputs(
 
     Returns the people who are authors of several submissions. If the rubric is `anonymous`, all
     names are left out, and `anonymous-key.csv` has them. Feedback of submissions that are no longer
-    in the class is removed; other files stay.
+    in the class is removed, and so is that of a grade that is held back; other files stay.
     """
     rubric = book.rubric
     names = _names(book, out) if rubric.anonymous else None
@@ -56,6 +56,7 @@ def write_outputs(
     made_of = _read_made(folder)
     layout = _digest_layout(rubric)
     grades: list[Grade] = []
+    held: set[str] = set()
     now_of: dict[str, str] = {}
     gradings: dict[str, int] = {}
     authors: dict[str, tuple[str, ...]] = {}
@@ -69,7 +70,11 @@ def write_outputs(
         grade = seen.grade
         grades.append(grade)
         numbers[grade.submission] = recomputed_numbers(grade, rubric=rubric)
+        if entry.hold:
+            held.add(grade.submission)
         gradings[entry.submission], authors[entry.submission] = entry.grading, entry.grade.authors
+        if entry.hold:
+            continue
         now_of[grade.submission] = _digest(layout, entry.key, repr(grade))
         own = own_folder(folder, _checked(grade.submission))
         there = (own / _PAGE).is_file() and (own / _JSON).is_file()
@@ -89,17 +94,22 @@ def write_outputs(
         # The order of the class list would reveal the names.
         grades.sort(key=lambda grade: grade.submission)
     _remove_stale(folder, keep=set(now_of))
-    write_file(out / "grades.csv", grades_csv(grades, rubric=rubric))
+    write_file(out / "grades.csv", grades_csv(grades, rubric=rubric, held=held))
     repeated = repeated_authors_of(book, authors, gradings=gradings, names=names)
     clusters = find_clusters(shared)
     if names is not None:
         clusters = renamed(clusters, names, other=STRANGER)
     distant = find_distant(numbers)
-    whole = repeated, clusters, distant
+    whole = repeated, clusters, distant, sorted(held)
     now_of[_WHOLE] = _digest(layout, repr(whole), *now_of.values())
     if made_of.get(_WHOLE) != now_of[_WHOLE] or not (out / _CLASS).is_file():
         page = class_page(
-            grades, rubric=rubric, repeated_authors=repeated, clusters=clusters, distant=distant
+            grades,
+            rubric=rubric,
+            repeated_authors=repeated,
+            clusters=clusters,
+            distant=distant,
+            held=held,
         )
         write_file(out / _CLASS, page)
     write_file(
@@ -140,13 +150,33 @@ def repeated_authors_of(
     )
 
 
-def grades_csv(grades: Sequence[Grade], *, rubric: Rubric) -> str:
-    """Return `grades.csv`: one row per submission, one column per criterion."""
+def grades_csv(grades: Sequence[Grade], *, rubric: Rubric, held: Collection[str] = ()) -> str:
+    """Return `grades.csv`: one row per submission, one column per criterion.
+
+    Parameters
+    ----------
+    held : submissions whose grades are held back; their rows have no points.
+    """
     taken = {*_BEFORE, *_AFTER}
     ids = [criterion.id for criterion in rubric.criteria]
     heads = [f"criterion {id_}" if id_ in taken else id_ for id_ in ids]
     rows = [
         (
+            grade.submission,
+            " ".join(grade.authors),
+            "held",
+            "",
+            grade.out_of,
+            grade.days_late,
+            *[""] * (len(ids) + 1),
+            " ".join(grade.codes),
+            "",
+            "",
+            "",
+            "",
+        )
+        if grade.submission in held
+        else (
             grade.submission,
             " ".join(grade.authors),
             grade.status,

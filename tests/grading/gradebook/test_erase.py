@@ -44,9 +44,9 @@ def _fill(place: str, *, folder: Path | None = None) -> None:
     )
     shared = {KEPT: shared_flag(GONE), GONE: shared_flag(KEPT)}
     with book_of(place, *class_, shared=shared) as book:
+        book.set_reviewed(GONE, by="Ada", reviewed=True)
         book.release(by="Ada", released=True)
         book.ask(GONE, first.id, why="quagga: it is right", by="s-zebra")
-        book.set_reviewed(GONE, by="Ada", reviewed=True)
         book.override(GONE, gone.criteria[1].id, 0.5, why="quagga", by="Ada")
         finish(book, *class_, shared=shared)
         if folder:
