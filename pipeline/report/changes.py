@@ -1,6 +1,7 @@
 """Compare an earlier `results.json` with the current analysis.
 
-The section lists only numbers that changed and checks that fail now but did not before.
+The section lists only numbers that changed, checks that fail now but did not before, and the status
+if it changed.
 """
 
 from collections.abc import Iterator, Mapping
@@ -15,7 +16,7 @@ from pipeline.errors import ConfigError
 from pipeline.json_files import file_model, plain
 from pipeline.report.builder import Page
 from pipeline.report.document import Block, Cell, bullet_list, cell, paragraph
-from pipeline.results import Analysis
+from pipeline.results import Analysis, ReportStatus
 from pipeline.setup import Setup, Units
 from pipeline.submission.toml import first_refusal
 from pipeline.words.numbers import NOTHING, count, percent, significant, unit_text, with_error
@@ -85,10 +86,14 @@ class DraftChanges:
     ----------
     numbers : the numbers that changed.
     failed : message of each check that fails now but did not before, by the check's id.
+    passed : ids of the checks that failed before but do not fail now.
+    status : the status before and now, in words; () if it is the same, or was not known.
     """
 
     numbers: tuple[Change, ...]
     failed: dict[str, str]
+    passed: tuple[str, ...] = ()
+    status: tuple[str, ...] = ()
 
 
 # ------------------------------------------------------------------------ comparing
@@ -143,15 +148,29 @@ def compare_drafts(before: Draft, analysis: Analysis) -> DraftChanges:
         Change(what=what, name=name, before=then.get((what, name)), after=now.get((what, name)))
         for what, name in {**now, **then}
     )
-    failed_then = {check["id"] for check in before["checks"] if check["outcome"] == "fail"}
+    failed_then, failed_now = (
+        {check["id"]: check["message"] for check in draft["checks"] if check["outcome"] == "fail"}
+        for draft in (before, after)
+    )
+    status = _status(before), analysis.status.words
     return DraftChanges(
         numbers=tuple(change for change in changes if change.differs),
-        failed={
-            check["id"]: check["message"]
-            for check in after["checks"]
-            if check["outcome"] == "fail" and check["id"] not in failed_then
-        },
+        failed={id_: text for id_, text in failed_now.items() if id_ not in failed_then},
+        passed=tuple(id_ for id_ in failed_then if id_ not in failed_now),
+        status=status if status[0] and status[0] != status[1] else (),
     )
+
+
+def _status(draft: Draft) -> str:
+    """Return the status of a draft in words; "" if an earlier version of cartlab wrote none."""
+    state = draft.get("status")
+    if not state:
+        return ""
+    if state == "numbers_disagree":
+        n = sum(one["code"] == "number_off" for one in draft.get("findings", ()))
+    else:
+        n = sum(check["outcome"] == "fail" for check in draft["checks"])
+    return ReportStatus(state=state, count=n).words
 
 
 def _numbers(draft: Draft) -> Iterator[tuple[str, str, DraftNumber]]:
@@ -193,8 +212,12 @@ def changes_line(changes: DraftChanges) -> str:
             parts.append(f"{estimates} moved, {worst.name} most ({_moved(worst, between=', ')})")
     if changes.failed:
         parts.append(f"{count(len(changes.failed), 'check')} now failed")
+    if changes.passed:
+        parts.append(f"{count(len(changes.passed), 'check')} no longer failed")
     if changes.numbers and not parts:
         parts.append(f"{count(len(changes.numbers), 'number')} moved")
+    if changes.status:
+        parts.append("status: " + " → ".join(changes.status))
     return "since the earlier draft: " + ("; ".join(parts) or "nothing changed")
 
 

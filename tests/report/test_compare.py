@@ -79,6 +79,23 @@ def test_checks_that_fail_now_are_named():
     assert "1 check" in changes_line(compare_drafts(draft_of(was), now))
 
 
+def test_a_change_of_the_status_alone_is_named(tmp_path):
+    """If no number changed, the line says which status came in place of which."""
+    fine = replace(analysed("one-cart"), checks=(), reported_off=())
+    off = replace(fine, reported_off=("K", "zeta"))
+    assert (fine.status.state, off.status.state) == ("ok", "numbers_disagree")
+    changes = compare_drafts(draft_of(off), fine)
+    assert (changes.numbers, changes.failed) == ((), {})
+    assert changes.status == (off.status.words, fine.status.words)
+    line = changes_line(changes)
+    assert all(words in line for words in changes.status)
+    assert "nothing changed" not in line
+    old = {key: value for key, value in draft_of(off).items() if key != "status"}
+    assert compare_drafts(old, fine).status == ()
+    (tmp_path / "results.json").write_text(json_text(off), encoding="utf-8")
+    assert compare_drafts(read_results(tmp_path / "results.json"), fine) == changes
+
+
 def test_the_report_has_a_section_on_the_changes():
     """If an earlier draft is given, the report has a section with old and new numbers."""
     before = make_analysis(2)
