@@ -18,6 +18,7 @@ from pipeline.words.text import Span, Spans
 
 _MARK = re.compile(r"\*\*(?P<strong>.+?)\*\*|`(?P<code>.+?)`|\[(?P<link>.+?)\]\((?P<url>#.+?)\)")
 _VALUE = re.compile(r"\{(\w+)\}")
+_ASKED = re.compile(r"\?\.(?=\s|$)")  # the sentence's full stop after a value that is a question
 _LARGEST = 1_000_000  # largest file in bytes
 
 
@@ -76,7 +77,7 @@ def phrases(subject: str, table: str = "") -> Phrases:
 
 
 def _filled_in(template: str, values: Mapping[str, object]) -> str:
-    return _VALUE.sub(lambda name: str(values[name[1]]), template)
+    return _ASKED.sub("?", _VALUE.sub(lambda name: str(values[name[1]]), template))
 
 
 def _spans(template: str, values: Mapping[str, str | Spans]) -> Iterator[Span]:
@@ -101,7 +102,7 @@ def _filled(text: str, like: Span, values: Mapping[str, str | Spans]) -> Iterato
         if isinstance(value, str):
             said += value
         else:
-            yield replace(like, text=said)
+            yield replace(like, text=_ASKED.sub("?", said))
             yield from value
             said = ""
-    yield replace(like, text=said)
+    yield replace(like, text=_ASKED.sub("?", said))

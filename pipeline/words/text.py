@@ -116,6 +116,11 @@ def breakable(name: str) -> Markup:
     return Markup(_BREAK.sub("<wbr>", str(escape(name))))
 
 
+def sentence(text: str) -> str:
+    """Return a text with a full stop, unless it already ends a sentence."""
+    return text if text.endswith((".", "?", "!")) else f"{text}."
+
+
 def capital(text: str) -> str:
     """Return a phrase with a capital first letter."""
     return text[:1].upper() + text[1:]

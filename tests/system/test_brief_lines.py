@@ -1,8 +1,12 @@
 """The summary that `cartlab report` prints fits a terminal."""
 
+import shutil
+
 import pytest
 
 from pipeline.cli.common import brief_lines
+from pipeline.resources import EXAMPLES
+from tests.helpers.commandline import cartlab_here
 
 ITEMS = [f"- Item {i} is odd. {'It has details. ' * 12}" for i in range(9)]
 LONG = "\n".join(["A model was found. " * 3, *ITEMS, "Next:", *ITEMS])
@@ -34,3 +38,20 @@ def test_what_is_left_out_is_counted():
     lines = brief_lines(LONG, width=80, most=12, more="the page")
     left = 18 - sum(line.startswith("- Item") for line in lines)
     assert lines[-1] == f"- {left} more: see the page"
+
+
+def test_many_files_that_cannot_be_read_do_not_fill_the_terminal(tmp_path):
+    """The terminal shows some of the files; all are on the page."""
+    folder = tmp_path / "one-cart"
+    shutil.copytree(EXAMPLES / "one-cart", folder)
+    with (folder / "submission.toml").open("a", encoding="utf-8") as toml:
+        for i in range(30):
+            (folder / "data" / f"odd-{i}.csv").write_text("time,input,x1\n0,0,0\n1,?,0\n")
+            toml.write(f'\n[[experiments]]\nid = "odd-{i}"\nkind = "step"\n')
+            toml.write(f'file = "data/odd-{i}.csv"\n')
+    done = cartlab_here("report", folder, "--no-pdf")
+    assert done.returncode == 1
+    lines = [line for line in done.stderr.splitlines() if not line.endswith(" s")]
+    assert len(lines) <= 20
+    page = (folder / "report" / "report.html").read_text(encoding="utf-8")
+    assert all(f"odd-{i}:" in page or f"odd-{i}<" in page for i in range(30))

@@ -10,7 +10,7 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.resources import TEMPLATES
 from pipeline.words.phrases import Phrases
-from pipeline.words.text import Span
+from pipeline.words.text import Span, plain
 from tests.helpers.places import ROOT
 
 PIPELINE = ROOT / "pipeline"
@@ -74,6 +74,15 @@ def test_values_in_a_sentence_are_never_markup(tmp_path):
     assert words.text("a", name=3).startswith("**Yes: **3,")
     name = (Span("K", "em"),)
     assert words.spans("a", name=name)[1:3] == (Span("K", "em"), Span(", see "))
+
+
+def test_a_value_that_is_a_question_ends_its_sentence(tmp_path):
+    """No full stop follows the question mark of a value at the end of a sentence."""
+    catalogue = written(tmp_path, 'odd = "{what} is **odd: **{why}."')
+    said = {"why": "is it another?", "what": "a?.b"}
+    assert catalogue.text("odd", **said).endswith("is it another?")
+    assert plain(catalogue.spans("odd", **said)) == "a?.b is odd: is it another?"
+    assert catalogue.text("odd", what="it", why="so").endswith("so.")
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,7 @@ from pipeline.grading.words import WORDS
 from pipeline.names import parameter_names, read_name
 from pipeline.plant.identities import parameter_orders, recover_from_parameters
 from pipeline.words.numbers import first_few, group_messages
+from pipeline.words.text import sentence
 
 _NAMED = 4  # largest number of parameters or laws in one message
 
@@ -84,7 +85,7 @@ def _required(criterion: asked.RequiredPieces, context: GradingContext) -> Verdi
     said = say_missing(missing, most=_NAMED) or "Everything required is here."
     if any(piece.kind is None for piece in pieces) and context.strange:
         unknown = "; ".join(context.strange[:_NAMED])
-        said += f" Cannot be read: {unknown}{'' if unknown.endswith('?') else '.'}"
+        said += f" Cannot be read: {sentence(unknown)}"
     return Verdict(
         share=share_there(pieces),
         message=said + (f" Not counted, because they cannot be read: {unread}." if unread else ""),
@@ -97,7 +98,7 @@ def _data(_: asked.DataQuality, context: GradingContext) -> Verdict:
     problems, runs = context.problems, len(context.submission.experiments)
     share = share_sound(context)
     said = group_messages((run, why.rstrip(".")) for run, why in problems.items())[:_NAMED]
-    faults = " ".join(text if text.endswith("?") else f"{text}." for text in said)
+    faults = " ".join(map(sentence, said))
     if not runs and not problems:
         faults = "There are no recordings."
     elif share == 1 and problems:
@@ -125,13 +126,13 @@ def _parameters(criterion: asked.Parameters, context: GradingContext) -> Verdict
     unproved = {n: f"no usable {needs[n]}" for n in judged if n in needs and n in table}
     if unproved and len(unproved) == len(judged):
         why = "; ".join(group_messages(unproved.items()))
-        return Verdict(share=None, message=f"Not checked, so it earns no points. {why}.")
+        return Verdict(share=None, message=f"Not checked, so it earns no points. {sentence(why)}")
     if not judged:
         reasons = [s.reason for s in context.analysis.skipped]
         if off_scale(context.analysis):
             reasons = [OFF_SCALE]
         why = reasons[0] if reasons else "these are first guesses that no recording can confirm"
-        return Verdict(share=None, message=f"Not checked: {why}.")
+        return Verdict(share=None, message=f"Not checked: {sentence(why)}")
     unread = {name: context.why_unread(criterion.check, name) for name in judged}
     said = group_messages(unread.items())
     off = [f"Cannot be read: {'; '.join(said)}"] if said else []

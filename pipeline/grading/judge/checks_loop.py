@@ -27,6 +27,7 @@ from pipeline.grading.tolerance import (
 )
 from pipeline.grading.words import WORDS
 from pipeline.results import Stage
+from pipeline.words.text import sentence
 
 Judged = Callable[[LoopNumbers], tuple[Deviation, ...]]
 
@@ -214,8 +215,8 @@ def judge_hardware(criterion: asked.Hardware, context: GradingContext) -> Verdic
         why = reasons[0] if reasons else "the controller that ran or its gains are not stated"
         fit = context.analysis.fit
         if fit is None or not fit.converged:  # this proves nothing about the loop
-            return Verdict(share=None, message=f"Not checked: {why}.")
-        return Verdict(share=NONE, message=f"The loop cannot be compared: {why}.")
+            return Verdict(share=None, message=f"Not checked: {sentence(why)}")
+        return Verdict(share=NONE, message=f"The loop cannot be compared: {sentence(why)}")
     errors = {run: 100 * float(np.sqrt(np.mean(np.square(e)))) for run, e in closed.items()}
     run = min(errors, key=lambda name: errors[name])
     deviation = Deviation(error=exact(errors[run]))

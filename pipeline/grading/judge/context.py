@@ -25,6 +25,7 @@ from pipeline.submission import (
     Submission,
 )
 from pipeline.words.numbers import first_few
+from pipeline.words.text import sentence
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +173,7 @@ class GradingContext:
     def because_unread(self, *at: str) -> str:
         """Return the reason as a further sentence, with a space before it; "" without a reason."""
         why = self.why_unread(*at)
-        return f" Cannot be read: {why}." if why else ""
+        return f" Cannot be read: {sentence(why)}" if why else ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,11 +310,11 @@ def data_flag(problems: Mapping[str, str]) -> Flag:
     first, problem = next(iter(problems.items()))
     others = len(problems) - 1
     have = "recording has" if others == 1 else "recordings have"
-    more = f" ({others} more {have} a problem)" if others else ""
+    more = f" {others} more {have} a problem." if others else ""
     return Flag(
         code="data_problem",
         parameters=tuple(problems),
-        message=f"{first}: {problem.rstrip('.')}{more}.",
+        message=f"{first}: {sentence(problem)}{more}",
         evidence={"problems": dict(problems)},
     )
 

@@ -33,7 +33,17 @@ from pipeline.words.numbers import (
     with_error,
 )
 from pipeline.words.phrases import phrases
-from pipeline.words.text import Span, Spans, clean, name_span, names_spans, plain, rich, spans
+from pipeline.words.text import (
+    Span,
+    Spans,
+    clean,
+    name_span,
+    names_spans,
+    plain,
+    rich,
+    sentence,
+    spans,
+)
 
 _WORDS = phrases("summary")
 _KINDS = {  # names for kinds of recordings
@@ -495,7 +505,7 @@ def _failed(analysis: Analysis) -> Iterator[Spans]:
         shown = checks[: 1 if group in _ALIKE else _MOST_TOLD]
         shown = [check for check in shown if check.kind == group] if group == "groups" else shown
         shown = () if group in _TOLD_ELSEWHERE else shown
-        messages = dict.fromkeys(_sentence(clean(check.message)) for check in shown)
+        messages = dict.fromkeys(sentence(clean(check.message)) for check in shown)
         yield _WORDS.spans(
             "failed",
             action=_action(group, checks, analysis),
@@ -542,7 +552,7 @@ def _to_identify(analysis: Analysis) -> Spans:
         if skip.stage is Stage.FINAL_ESTIMATES:
             if skip.missing:
                 return _WORDS.spans("do_record_for_fit", missing=skip.missing)
-            return _WORDS.spans("do_identify", reason=_sentence(clean(skip.reason)))
+            return _WORDS.spans("do_identify", reason=sentence(clean(skip.reason)))
     return _WORDS.spans("do_fit_identified")
 
 
@@ -552,10 +562,6 @@ def _names(checks: Sequence[Check]) -> Spans:
     if len(checks) == 1 or len(abouts) < len(checks):
         return spans(Span(", ".join(clean(check.id) for check in checks), "code"))
     return spans(Span(f"{clean(checks[0].kind)}: {', '.join(abouts)}", "code"))
-
-
-def _sentence(text: str) -> str:
-    return text if text.endswith((".", "?", "!")) else f"{text}."
 
 
 def _advice(analysis: Analysis) -> Iterator[Spans]:
@@ -599,7 +605,7 @@ def _set_up_in_doubt(analysis: Analysis) -> _Finding | None:
     if not wrong:
         return None
     sentences = (
-        _WORDS.spans(f"top_{_group(c)}", message=_sentence(clean(c.message))) for c in wrong
+        _WORDS.spans(f"top_{_group(c)}", message=sentence(clean(c.message))) for c in wrong
     )
     told = tuple(span for one in sentences for span in (*one, Span(" ")))[:-1]
     return _Finding(False, told)
