@@ -158,8 +158,7 @@ def check_vanishing(
         found = say(
             seen,
             name=name,
-            value=f"{value:.2g}",
-            std=f"{std.get(name) or 0.0:.1g}",
+            value=with_error(value, std.get(name)) if sigmas else f"{value:.2g}",
             percent=f"{100 * share:.2g}",
             beside=beside,
         )

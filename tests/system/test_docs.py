@@ -13,6 +13,7 @@ from typer.main import get_command
 
 from pipeline.cli import app, main
 from pipeline.cli.common import MORE, ROLES
+from pipeline.resources import EXAMPLES
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.places import ROOT
 
@@ -148,6 +149,20 @@ def test_commands_are_grouped_by_role(page, group, command):
     listed = {role: re.findall(command, part, re.MULTILINE) for role, part in groups}
     assert {role: tuple(listed[role]) for role in ROLES} == ROLES
     assert set(listed[MORE]) == set(COMMANDS) - {name for names in ROLES.values() for name in names}
+
+
+def test_every_file_of_a_work_folder_is_documented(tmp_path):
+    """All that `fill`, `check` and `report` leave in a submission is named in the documentation."""
+    folder = tmp_path / "one-cart"
+    shutil.copytree(EXAMPLES / "one-cart", folder)
+    before = {path.name for path in folder.rglob("*")}
+    for command in (["fill"], ["check"], ["report", "--no-pdf", "--tables", "--plots"]):
+        cartlab_here(command[0], folder, *command[1:])
+    left = {path.name for place in (folder, folder / "report") for path in place.iterdir()}
+    text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    new = left - before
+    assert {"report", ".turn", "questions.json"} <= new
+    assert [name for name in sorted(new) if name not in text] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -329,6 +329,16 @@ def test_numbers_can_be_copied(three, show):
     assert matrix.count(";") == 6
 
 
+def test_a_phone_shows_the_numbers_in_two_columns(three, show):
+    """The tiles of three carts fit a phone in two columns."""
+    page = show(page_of(three), size=PHONE)
+    tiles = page.locator("dl.tiles").first.locator(".tile")
+    boxes = [tile.bounding_box() for tile in tiles.all()]
+    assert len({round(box["x"]) for box in boxes}) == 2
+    values = page.locator("dl.tiles").first.locator("dd.value")
+    assert values.evaluate_all("all => all.every(one => one.scrollWidth <= one.clientWidth)")
+
+
 def test_without_scripts_everything_can_be_read(three, show):
     """Without scripts all figures, numbers and folded parts can be read."""
     page = show(page_of(three), java_script_enabled=False)
