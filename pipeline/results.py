@@ -150,6 +150,11 @@ class Record:
         """The free carts that were measured, in the order of the rows of y."""
         return tuple(cart for cart in self.carts if cart in self.free)
 
+    @property
+    def input(self) -> Array:
+        """The input (n,); zero if the file has none."""
+        return np.zeros(self.t.size) if self.u is None else self.u
+
     def part(self, samples: slice) -> "Record":
         """Return the record with only some of its samples."""
         u, reference = (None if a is None else a[samples] for a in (self.u, self.reference))

@@ -486,7 +486,7 @@ def _zeta_at_amplitude(amplitude: Array) -> Array:
 def _note(record: Record, decay: FreeDecay, *, n_peaks: int) -> str:
     notes = []
     level = decay.stretch.level
-    if level and record.u is not None and abs(level) > 0.02 * float(np.max(np.abs(record.u))):
+    if level and abs(level) > 0.02 * float(np.max(np.abs(record.input))):
         notes.append(f"the cart oscillates about its new rest point, at an input of {level:.4g}")
     if n_peaks < _PEAKS_FOR_REGRESSION:
         notes.append(

@@ -209,7 +209,7 @@ class WindowMeans:
         self.record = record
         t, width = record.t, _width(record)
         first = np.arange(0, t.size - width + 1, _hop(record))
-        u = np.zeros(t.size) if record.u is None else record.u
+        u = record.input
         inputs = np.array([*(np.interp(t - lag, t, u) for lag in _LAGS), u != 0.0])
         # At most 1000 windows are computed at once, to limit the memory for long recordings.
         parts = np.array_split(first, -(-first.size // 1000))
@@ -477,7 +477,7 @@ def _bursts(cart: int, seen: Sequence[WindowMeans]) -> list[Intervention]:
     driven = {
         record.id: float(record.t[0])
         for record in (one.record for one in seen)
-        if record.u is not None and np.any(record.u)
+        if np.any(record.input)
     }
     return [one for one in found if not _recurs(one, found, driven)]
 

@@ -305,7 +305,7 @@ def response_from_records(records: Sequence[Record]) -> tuple[FrequencyResponse,
     ------
     DataError : no record has an input that changes, or no record gives a usable frequency.
     """
-    runs = [r for r in records if r.u is not None and np.any(r.u != 0) and r.t.size > 16]
+    runs = [r for r in records if np.any(r.input != 0) and r.t.size > 16]
     if not runs:
         raise DataError("frequency response: needs a step or sweep with its input, found none")
     omega = _grid(runs)

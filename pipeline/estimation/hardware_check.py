@@ -58,7 +58,7 @@ class MeasuredRun:
 
         The last sample of the input acts only after the record, so it does not count.
         """
-        return self.record.u is not None and bool(np.any(self.record.u[:-1] != 0))
+        return bool(np.any(self.record.input[:-1] != 0))
 
     def forced(self) -> Array:
         """Return the response (f, n) of the chain, from rest, to the logged input."""

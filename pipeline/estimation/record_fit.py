@@ -90,7 +90,7 @@ class Correction:
 def is_driven(record: Record) -> bool:
     """Return whether a logged input that no controller chose moves the carts."""
     driven = record.kind in ("step", "sine", "sweep") and 1 in record.free
-    return driven and record.u is not None and bool(np.ptp(record.u) > 0)
+    return driven and bool(np.ptp(record.input) > 0)
 
 
 def record_fits(records: Sequence[Record], chain: Chain) -> dict[str, RecordFit]:

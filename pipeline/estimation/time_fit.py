@@ -203,8 +203,8 @@ def open_window(record: Record) -> FitWindow:
         if not np.ptp(position) > record.encoder_step(cart):
             raise DataError(f"{record.id}: time fit needs carts that move, cart {cart} does not")
     drive_t, drive_u, stride = t - t[0], None, 1
-    if 1 in record.free and record.u is not None and np.any(record.u[used]):
-        drive_u = record.u[used]
+    if 1 in record.free and np.any(record.input[used]):
+        drive_u = record.input[used]
         if record.hold == "band_limited":
             fine_t, fine_u = interpolate_band_limited(drive_t, drive_u)
             # Holding the value at the middle of an eight times finer step has an error of (omega dt

@@ -481,8 +481,7 @@ def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Rec
     """
     chain = propose.identified_chain(analysis)
     driven = [record for record in analysis.records if record.kind in ("step", "sweep")]
-    inputs = [float(np.abs(record.u).max()) for record in driven if record.u is not None]
-    hardest = max(inputs, default=0.0)
+    hardest = max((float(np.abs(record.input).max()) for record in driven), default=0.0)
     furthest = min(
         max((float((side * y).max()) for record in driven for y in record.y), default=0.0)
         for side in (1, -1)

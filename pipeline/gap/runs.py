@@ -213,7 +213,7 @@ def make_run(record: Record, *, n: int, part_of: Record | None = None) -> GapRun
     y = np.array([record.position(row + 1) for row in rows])
     resolution = np.array([record.encoder_step(row + 1) for row in rows])
     guided = _guided(record, n=n)
-    t, u = record.t, record.u if record.u is not None else np.zeros(record.t.size)
+    t, u = record.t, record.input
     still = np.maximum(_STILL * resolution, 4.0 * difference_noise(y, order=4))
     # The rest is known only if the carts do not move in the last 12 % of the record.
     tail = y[:, -max(3, int(0.12 * t.size)) :]
@@ -300,11 +300,10 @@ def _input_of(record: Record, *, before: float | None) -> tuple[Array, Array]:
 
     By default this is the first input. A band-limited input keeps its mean between knots.
     """
-    u = np.zeros(record.t.size) if record.u is None else record.u
-    first = float(u[0]) if before is None else before
-    knots, command = record.t, u
+    knots, command = record.t, record.input
+    first = float(command[0]) if before is None else before
     if record.hold == "band_limited":
-        knots, smooth = interpolate_band_limited(record.t, u)
+        knots, smooth = interpolate_band_limited(knots, command)
         command = np.append(0.5 * (smooth[1:] + smooth[:-1]), smooth[-1])
     return np.append(knots[0] - record.sample_time, knots), np.append(first, command)
 
@@ -513,7 +512,7 @@ def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int)
         if _is_usable(piece):
             later = piece.t[0] > record.t[0]
             if later:
-                let_go = piece.u is None or not np.any(piece.u)
+                let_go = not np.any(piece.input)
                 piece = replace(piece, kind="decay" if let_go else "sweep")
             run = make_run(piece, n=n, part_of=record if later else None)
             # A cart that rests until a hand moves it shows nothing.

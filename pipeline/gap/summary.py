@@ -254,7 +254,7 @@ def make_traces(before: Hypothesis, after: Hypothesis, study: Study) -> tuple[Tr
     ):
         linear = simulate_run(before.fit, run, nuisance_before)
         final = simulate_run(after.fit, run, nuisance_after)
-        u = run.record.u[-run.t.size :] if run.record.u is not None else np.zeros(run.t.size)
+        u = run.record.input[-run.t.size :]
         out += [
             Trace(
                 experiment=run.id,

@@ -139,7 +139,7 @@ def _scales(submission: Submission, records: Sequence[Record]) -> Iterator[Assum
 
 
 def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterator[Assumption]:
-    driven = [r for r in data.records if r.u is not None and np.ptp(r.u) > 0]
+    driven = [r for r in data.records if np.ptp(r.input) > 0]
     if not driven:
         return
     stated = system.input.sign

@@ -121,7 +121,7 @@ def _may_be_a_limit(
     Their inputs must be equally large, because only then does a limit give the same factor. And no
     record with such a large input may follow the chain.
     """
-    size = {r.id: 0.0 if r.u is None else float(np.abs(r.u).max()) for r in records}
+    size = {r.id: float(np.abs(r.input).max()) for r in records}
     sizes = [size[record.id] for record in sharing]
     follows = [size[r.id] for r in records if r not in sharing and fits[r.id].is_consistent]
     equal = (1 - SAME_SIZE) * max(sizes)

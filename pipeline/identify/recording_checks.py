@@ -290,7 +290,7 @@ def span(record: Record, first: int, last: int) -> dict[str, str]:
 
 def _other_kinds(records: Sequence[Record], *, files: Mapping[str, str]) -> Iterator[Finding]:
     """Yield the records that are copies, truncated, or of another kind of experiment."""
-    largest = max((float(np.abs(r.u).max()) for r in records if r.u is not None), default=0.0)
+    largest = max((float(np.abs(r.input).max()) for r in records), default=0.0)
     first: dict[str, str] = {}
     for record in records:
         original = first.setdefault(files.get(record.source, record.source), record.source)

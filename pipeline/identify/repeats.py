@@ -75,7 +75,7 @@ def _excitation(record: Record) -> Array:
     """Return what drove the record (n,): its set point in closed loop, else its input."""
     if record.kind == "closed_loop" and record.reference is not None:
         return record.reference
-    return record.t * 0 if record.u is None else record.u
+    return record.input
 
 
 def _is_repeat(first: Record, other: Record) -> bool:
