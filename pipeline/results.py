@@ -152,7 +152,7 @@ class Record:
 
     @property
     def input(self) -> Array:
-        """The input (n,); zero if the file has none."""
+        """The input (n,), which is zero if the file lacks it."""
         return np.zeros(self.t.size) if self.u is None else self.u
 
     def part(self, samples: slice) -> "Record":
