@@ -34,7 +34,7 @@ from benchmarks.page import section, write_page
 PAGES = {
     "README.md": ("bode", "gap_tools", "grading", "report"),
     "published.md": ("silverbox", "emps", "friction"),
-    "own.md": ("feedback", "time_fit", "time_stages"),
+    "own.md": ("feedback", "new_rubric", "time_fit", "time_stages"),
 }
 BENCHMARKS = tuple(name for names in PAGES.values() for name in names)
 FOLDER = Path(__file__).parent

@@ -32,7 +32,7 @@ from pipeline.words.progress import Progress
 ROLES = {
     "Students": ("fill", "inspect", "report", "check", "gap", "desk"),
     "TAs": ("grade", "override", "adjust", "hold", "history", "export", "check-rubric"),
-    "Instructors": ("new", "plan", "acquire", "explore", "simulate", "solution"),
+    "Instructors": ("new", "plan", "acquire", "explore", "simulate", "solution", "new-rubric"),
 }
 MORE = "More"
 

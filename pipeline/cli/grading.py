@@ -1,4 +1,4 @@
-"""Commands of a class: grade, override, history, export, survey, check-rubric."""
+"""Commands of a class: grade, override, history, export, survey, new-rubric, check-rubric."""
 
 import json
 import os
@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.common import AsJson, app, ctrl_c_says, log_progress, say
+from pipeline.cli.common import AsJson, app, ctrl_c_says, log_progress, progress_line, say
 from pipeline.errors import ConfigError
 from pipeline.grading.platforms import PLATFORMS
 
@@ -466,9 +466,51 @@ def survey(
         typer.echo(survey_text(found))
 
 
+@app.command("new-rubric")
+def write_rubric(
+    reference: Annotated[
+        Path, typer.Option("--from", metavar="DIR", help="A submission folder, such as your own.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The rubric to write.")] = Path(
+        "rubric.toml"
+    ),
+) -> None:
+    """Write a rubric from a reference submission: what its recordings can decide."""
+    from pipeline.grading.new_rubric import new_rubric
+    from pipeline.output import write_file
+    from pipeline.submission import load_submission
+    from pipeline.words.numbers import count
+    from pipeline.workflow import analyse
+
+    if out.exists():
+        raise ConfigError(f"{out}: exists already; choose another file with --out")
+    submission = load_submission(reference)
+    with progress_line() as progress:
+        analysis = analyse(submission, design=False, progress=progress)
+    if failed := len(analysis.failed_checks):
+        say(f"{count(failed, 'check')} of the recordings failed; see `cartlab report {reference}`")
+    new = new_rubric(submission, analysis, source=reference.resolve().name)
+    write_file(out, new.text)
+    for left_out in new.undecided:
+        say(f"not asked: {left_out}")
+    what = f"{len(new.rubric.criteria)} criteria"
+    say(
+        f"wrote {out}: {what}, {new.rubric.out_of:g} points; "
+        f"try `cartlab check-rubric {out} --from {reference}`"
+    )
+
+
 @app.command("check-rubric")
 def check_rubric(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A rubric file or shipped name.")],
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="DIR",
+            help="Also grade simulated students who have the recordings of this submission.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Validate a rubric and show what it requires."""
@@ -476,7 +518,20 @@ def check_rubric(
     from pipeline.grading.rubric_text import rubric_dict, rubric_text
 
     rubric = load_rubric(file)
+    shown: dict[str, Any] = {} if not as_json else rubric_dict(rubric)
+    text = "" if as_json else rubric_text(rubric)
+    if reference is not None:
+        from pipeline.grading.simulated_class import class_dict, class_text, simulate_class
+        from pipeline.submission import load_submission
+
+        submission = load_submission(reference)
+        with progress_line() as progress:
+            found = simulate_class(submission, rubric=rubric, progress=progress)
+        if as_json:
+            shown["simulated"] = class_dict(found)
+        else:
+            text += f"\n\n{class_text(found)}"
     if as_json:
-        typer.echo(json.dumps(rubric_dict(rubric), indent=1, ensure_ascii=False))
+        typer.echo(json.dumps(shown, indent=1, ensure_ascii=False))
     else:
-        typer.echo(rubric_text(rubric))
+        typer.echo(text)

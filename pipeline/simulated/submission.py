@@ -421,13 +421,14 @@ def initial_estimates(
     """Return the students' initial estimates of every named parameter.
 
     Gains come from the steps. The carts' own frequencies and dampings come from their decays.
-    Resonances and nulls are at the nearest dwell, and their dampings are guessed.
+    Resonances and nulls are at the nearest dwell, and their dampings are guessed; without dwells,
+    all numbers are read with similar errors.
     """
     typed: dict[str, Value] = {}
     for name, value in chain.parameters().items():
         read = read_name(name)
         error = float(np.clip(rng.standard_normal(), -2, 2))
-        if read.is_by_eye and chain.n > 1:
+        if read.is_by_eye and chain.n > 1 and dwells_hz:
             nearest = min((2 * math.pi * f for f in dwells_hz), key=lambda w: abs(w - value))
             typed[name] = _GUESSED_ZETA if read.is_ratio else _significant(nearest)
         else:

@@ -109,9 +109,12 @@ def make_bench(rng: np.random.Generator, *, carts: int) -> Bench:
     )
 
 
-def rubric_of(bench: Bench) -> Rubric:
-    """Return the rubric of a class that uses this bench."""
-    rubric = load_rubric(Path(f"throne-{bench.chain.n}dof"))
+def rubric_of(bench: Bench, rubric: Rubric | None = None) -> Rubric:
+    """Return the rubric of a class that uses this bench, from one for as many carts.
+
+    By default, it is the shipped one. The task of the controller is the submission's own.
+    """
+    rubric = rubric or load_rubric(Path(f"throne-{bench.chain.n}dof"))
     runs = tuple(
         run.model_copy(update={"at_least": min(run.at_least, DWELLS[0])})
         for run in rubric.required.experiments
@@ -120,6 +123,7 @@ def rubric_of(bench: Bench) -> Rubric:
         update={
             "system": rubric.system.model_copy(update={"springs": bench.springs}),
             "required": rubric.required.model_copy(update={"experiments": runs}),
+            "design": None,
         }
     )
 

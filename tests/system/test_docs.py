@@ -117,10 +117,10 @@ def test_the_page_on_an_own_lab_works(monkeypatch, tmp_path):
             done = cartlab_here(*arguments)
             assert done.returncode == 0, done.stderr
             ran.append(arguments[0])
-    assert {"fill", "report", "check", "grade", "export"} <= set(ran)
+    assert {"fill", "report", "check", "new-rubric", "check-rubric", "grade", "export"} <= set(ran)
     for folder in ("trial", "grades"):
         table = pd.read_csv(tmp_path / folder / "grades.csv")
-        assert set(table["points"]) == {10}
+        assert set(table["points"]) == {20}
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
