@@ -124,6 +124,8 @@ def desk(team: Path, grades: Path) -> None:
         page.get_by_label("Folder on this computer").fill(str(grades))
         page.get_by_role("button", name="Open").click()
         page.get_by_role("link", name="team-2", exact=True).click()
+        page.get_by_role("link", name="Frequencies from the Bode fit").click()
+        page.locator("figure, svg, img").first.wait_for()
         page.screenshot(path=IMAGES / "desk-team.png")
         page.goto(f"{server.url.rsplit('/', 2)[0]}/exercises/?effect=coulomb_friction")
         page.locator("#hidden img").scroll_into_view_if_needed()
