@@ -276,13 +276,24 @@ def emulate(
     remote: Annotated[
         bool, typer.Option("--remote", help="Listen to other computers too.")
     ] = False,
+    key: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Be the bench of --team in this answer key."),
+    ] = None,
+    team: Annotated[str, typer.Option(help="With --key: the name of the team's folder.")] = "",
 ) -> None:
     """Run a virtual bench that speaks the serial protocol; print its address on stderr."""
     from pipeline.simulated.emulator import EmulatorOptions, Server
     from pipeline.simulated.hidden import prepare_bench
     from pipeline.simulated.links import RunningBench, announced
 
+    if (key is None) == bool(team):
+        raise typer.BadParameter("--key and --team belong together")
     bench = prepare_bench(preset=preset, model=model, hide=hide or ())
+    if key is not None:
+        from pipeline.simulated.answer_key import bench_of_team
+
+        bench = bench_of_team(bench, team=team, key=key)
     options = EmulatorOptions(
         port=port,
         remote=remote,

@@ -283,6 +283,18 @@ class Hardware(_Criterion):
     none_percent: Percent = 90.0
 
 
+class Effects(_Criterion):
+    """Compare the effects that the students named with those of their bench in the answer key.
+
+    The name, the place and each parameter of every effect count equally. An effect that the bench
+    does not have counts as one wrong number.
+    """
+
+    check: Literal["effects"]
+    full_percent: Percent = 10.0
+    none_percent: Percent = 50.0
+
+
 class Manual(_Criterion):
     """A criterion that a person grades, such as the discussion; the message says what is asked."""
 
@@ -300,6 +312,7 @@ Criterion = Annotated[
     | Claims
     | Prefilter
     | Hardware
+    | Effects
     | Manual,
     Field(discriminator="check"),
 ]

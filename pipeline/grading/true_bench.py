@@ -17,6 +17,7 @@ from pipeline.ingest.columns import conversion
 from pipeline.json_files import json_text
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
+from pipeline.plant.effect import EffectTerm
 from pipeline.results import Analysis, Finding
 from pipeline.simulated.answer_key import TeamBench, read_key
 from pipeline.submission import System
@@ -31,12 +32,13 @@ class TrueBench:
     Attributes
     ----------
     found : the values that an analysis of the recordings of this bench gives.
-    is_linear : whether the bench has no hidden effect.
+    effects : the hidden effects; None if their units are not those of the submission.
     """
 
     chain: Chain
     parameters: Mapping[str, float]
     found: Mapping[str, float]
+    effects: Sequence[EffectTerm] | None
     is_linear: bool
 
     @classmethod
@@ -54,6 +56,7 @@ class TrueBench:
             chain=Chain(m=chain.m / gain, c=chain.c / gain, k=chain.k / gain),
             parameters=scaled(bench.parameters),
             found=scaled(bench.found),
+            effects=bench.model.terms if gain == length == 1 else None,
             is_linear=not bench.model.terms,
         )
 

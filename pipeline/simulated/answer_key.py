@@ -23,7 +23,7 @@ from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain, EffectTerm
 from pipeline.setup import Units
 from pipeline.simulated.bench import SimulatedBench
-from pipeline.submission.toml import read_text
+from pipeline.submission.toml import nearest, read_text
 
 MOST_PERCENT = 50.0  # a larger change may exchange the order of resonances
 _MOST_BYTES = 10_000_000
@@ -104,6 +104,20 @@ def read_key(path: Path) -> AnswerKey:
             f"{path}: is not an answer key; give the file that an earlier `simulate --vary` "
             "wrote, or a new one"
         ) from None
+
+
+def bench_of_team(bench: SimulatedBench, *, team: str, key: Path) -> SimulatedBench:
+    """Return a bench with the carts, springs and effects that an answer key has for a team.
+
+    Raises
+    ------
+    ConfigError : the file is not an answer key, or has no bench for this team.
+    """
+    teams = read_key(key).teams
+    if team not in teams:
+        raise ConfigError(f"{key}: has no bench for {team!r}{nearest(team, [*teams])}")
+    model = teams[team].model
+    return replace(bench, name=team, chain=model.chain, effects=model.terms, effect_sentences=())
 
 
 def draw_bench(

@@ -396,12 +396,35 @@ def _reported_problems(submission: Submission) -> Iterator[tuple[Location, str]]
                 ("reported", "state_space", "B"),
                 f"expected {2 * n} numbers, found {len(space.B)}{_decimals(len(space.B), n)}",
             )
+    for key, stated in (reported.effects or {}).items():
+        yield from _effect_problems(key, stated, n)
     found = len(reported.feedback.gains) if reported.feedback else 0
     if found not in (0, 2 * n):
         yield (
             ("reported", "feedback", "gains"),
             f"expected {2 * n} gains, found {found}{_decimals(found, n)}",
         )
+
+
+def _effect_problems(
+    key: str, stated: Mapping[str, Decimal], n: int
+) -> Iterator[tuple[Location, str]]:
+    from pipeline.plant.catalogue import CATALOGUE
+
+    at = ("reported", "effects", key)
+    effect = next((effect for effect in CATALOGUE if effect.key == key), None)
+    if effect is None:
+        yield at, f"unknown effect{nearest(key, [effect.key for effect in CATALOGUE])}"
+        return
+    names = [p.name for p in effect.parameters if p.reported]
+    places = [] if effect.place == "input" else [effect.place]
+    for name in stated:
+        if name not in names + places:
+            yield at, f"unknown parameter {name!r}{nearest(name, names + places)}"
+    for place in places:
+        last = n if place == "cart" else n + 1
+        if place in stated and stated[place] not in range(1, last + 1):
+            yield at, f"there is no {place} {stated[place]}; expected 1 to {last}"
 
 
 def _decimals(found: int, n: int) -> str:

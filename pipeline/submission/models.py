@@ -264,12 +264,18 @@ class ReportedFeedback(TomlTable):
 
 
 class Reported(TomlTable):
-    """The students' reported numbers, with the digits as typed."""
+    """The students' reported numbers, with the digits as typed.
+
+    Attributes
+    ----------
+    effects : for each effect that the students found, its `cart` or `spring` and its parameters.
+    """
 
     initial: dict[str, TypedNumber] = {}
     final: dict[str, TypedNumber] = {}
     state_space: ReportedStateSpace | None = None
     feedback: ReportedFeedback | None = None
+    effects: dict[str, dict[str, TypedNumber]] | None = None
 
 
 class Students(TomlTable):

@@ -70,10 +70,17 @@ def test_shipped_rubrics_are_valid_and_worth_twenty_points(path):
     assert json.loads(json.dumps(rubric_dict(rubric)))["out_of"] == 20
 
 
-def test_four_rubrics_are_shipped():
-    """There is one shipped rubric for each of the paper's systems, and one in counts."""
+def test_six_rubrics_are_shipped():
+    """There is one for each of the paper's systems, one in counts, and two to name effects."""
     names = [path.stem for path in SHIPPED]
-    assert names == ["throne-1dof", "throne-2dof", "throne-3dof", "ucsd-mae171a"]
+    assert names == [
+        "effects-1dof",
+        "effects-2dof",
+        "throne-1dof",
+        "throne-2dof",
+        "throne-3dof",
+        "ucsd-mae171a",
+    ]
 
 
 def test_points_add_up_exactly(tmp_path):

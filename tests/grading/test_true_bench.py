@@ -2,17 +2,23 @@
 
 import json
 from dataclasses import replace
+from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from benchmarks import answer_key as copying
+from pipeline.grading import rubric as asked
 from pipeline.grading.gradings import HandIn
-from pipeline.grading.judge.run import Graded, grade_submission
+from pipeline.grading.judge.checks import judge
+from pipeline.grading.judge.run import Graded, grade_submission, prepare_work
 from pipeline.grading.reference import Reference, References, recompute
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.true_bench import SOURCE, TrueBench, with_benches
 from pipeline.json_files import json_text
+from pipeline.plant.catalogue import find_effect
+from pipeline.plant.effect import EffectTerm
 from pipeline.resources import RUBRICS
 from pipeline.simulated.answer_key import AnswerKey, TeamBench, draw_bench
 from pipeline.simulated.hidden import prepare_bench
@@ -133,3 +139,66 @@ def test_copiers_lose_points_and_honest_teams_do_not(tmp_path):
     assert kinds["honest"].min() >= 19.5
     assert kinds["numbers copied"][:, 1].max() <= 17
     assert kinds["all copied"].max() <= 10
+
+
+NAMED = asked.Effects(id="effects", check="effects", points=4)
+FRICTION = {"coulomb_friction": {"cart": 1, "force": Decimal("0.0031")}}
+
+
+@pytest.mark.parametrize(
+    ("effects", "share"),
+    [
+        (FRICTION, 1),
+        ({"coulomb_friction": {"cart": 1, "force": Decimal("0.0060")}}, Fraction(2, 3)),
+        ({"coulomb_friction": {"cart": 1}}, Fraction(2, 3)),
+        ({"coulomb_friction": {"force": Decimal("0.0031")}}, Fraction(2, 3)),
+        (FRICTION | {"input_delay": {"delay": Decimal("0.01")}}, Fraction(3, 4)),
+        ({"input_delay": {"delay": Decimal("0.01")}}, 0),
+        ({}, 0),
+        (None, 0),
+    ],
+)
+def test_named_effects_are_judged_by_the_key(friction, effects, share):
+    """Name, place and each size count equally; an effect that is not there counts as a mistake."""
+    submission, bench = friction
+    bench = replace(bench, model=replace(bench.model, terms=[known(0.0031)]))
+    reported = submission.reported.model_copy(update={"effects": effects})
+    submission = submission.model_copy(update={"reported": reported})
+    work = prepare_work(
+        submission,
+        analyse(submission, design=False),
+        rubric=RUBRIC,
+        bench=json_text(bench),
+    )[0]
+    verdict = judge(NAMED, work)
+    assert verdict.share == share
+    assert set(verdict.expected) == ({"coulomb_friction"} if effects is not None else set())
+
+
+def test_without_a_key_nobody_judges_named_effects(friction):
+    """An effect is not checked if nobody knows the bench."""
+    work = prepare_work(friction[0], analyse(friction[0], design=False), rubric=RUBRIC)[0]
+    assert judge(NAMED, work).share is None
+
+
+def known(force: float) -> EffectTerm:
+    return EffectTerm(effect=find_effect("coulomb_friction"), place=1, values=(force,))
+
+
+@pytest.mark.parametrize(
+    ("stated", "name"),
+    [
+        ("coulomb = { cart = 1 }", "coulomb"),
+        ("coulomb_friction = { cart = 2 }", "coulomb_friction"),
+        ("coulomb_friction = { size = 2 }", "coulomb_friction"),
+    ],
+)
+def test_an_effect_that_cannot_be_read_costs_itself(tmp_path, stated, name):
+    """An unknown effect, place or parameter counts as not reported; the rest stays."""
+    text = "version = 1\nsystem.carts = 1\nsystem.input.unit = 'V'\nsystem.position.unit = 'cm'\n"
+    text += f"[reported.effects]\n{stated}\ninput_delay = {{ delay = 0.01 }}\n"
+    (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
+    submission = load_submission(tmp_path)
+    assert [one.at for one in submission.unread] == [("reported", "effects", name)]
+    assert submission.reported and submission.reported.effects
+    assert submission.reported.effects["input_delay"] == {"delay": Decimal("0.01")}

@@ -1,5 +1,6 @@
 """The documentation is true: its commands run, its links work, and it is complete."""
 
+import json
 import re
 import shlex
 import shutil
@@ -121,6 +122,42 @@ def test_the_page_on_an_own_lab_works(monkeypatch, tmp_path):
     for folder in ("trial", "grades"):
         table = pd.read_csv(tmp_path / folder / "grades.csv")
         assert set(table["points"]) == {20}
+
+
+def conclusions(team: Path) -> str:
+    """Return what the report and the gap of a team say, as a student types it."""
+    results = json.loads((team / "report" / "results.json").read_text(encoding="utf-8"))
+    gap = json.loads((team / "gap" / "gap.json").read_text(encoding="utf-8"))
+    lines = ["", "[reported.final]"]
+    lines += [f"{row['name']} = {row['final']:.3g}" for row in results["parameters"]]
+    for effect in gap["effects"]:
+        lines += [f"[reported.effects.{effect['effect']}]"]
+        values = {**effect["where"], **{n: p["value"] for n, p in effect["parameters"].items()}}
+        lines += [f"{name} = {value:.3g}" for name, value in values.items()]
+    return "\n".join(lines)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_page_on_a_course_works(monkeypatch, tmp_path):
+    """What the commands of the page show of a team's bench earns all points for its effect.
+
+    A team that copies the numbers of its neighbour loses most of them.
+    """
+    monkeypatch.chdir(tmp_path)
+    teams = [Path("teams", name) for name in ("team-1", "team-2")]
+    for arguments, status, _ in examples(ROOT / "docs" / "course.md"):
+        if arguments[0] == "grade":
+            typed = conclusions(teams[0])
+            for team in teams:
+                with (team / "submission.toml").open("a", encoding="utf-8") as file:
+                    file.write(typed)
+        done = cartlab_here(*arguments)
+        assert done.returncode == status, done.stderr
+    grades = pd.read_csv("grades/grades.csv").set_index("submission")
+    assert grades.loc["team-1", "points"] == 20
+    assert grades.loc["team-2", "effects"] == 0
+    assert grades.loc["team-2", "points"] < 12
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))

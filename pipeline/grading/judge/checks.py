@@ -36,6 +36,7 @@ from pipeline.grading.tolerance import (
     NONE,
     Deviation,
     as_typed,
+    percent_off,
     points_for,
     points_for_one,
 )
@@ -297,6 +298,52 @@ def _state_space(criterion: asked.StateModel, context: GradingContext) -> Verdic
     )
 
 
+def _effects(criterion: asked.Effects, context: GradingContext) -> Verdict:
+    """Judge the named effects against those of the team's bench."""
+    if context.effects is None:
+        return Verdict(share=None, message="Not checked: no answer key has this bench.")
+    named = context.reported.effects
+    if named is None:
+        why = context.because_unread("effects")
+        return Verdict(share=NONE, message=f"No effect is reported.{why}")
+    hidden = {term.effect.key: term for term in context.effects}
+    deviations: list[Deviation] = []
+    off: list[str] = []
+    for key, term in hidden.items():
+        stated = named.get(key, {})
+        if key not in named:
+            off.append(f"an effect is missing{context.because_unread('effects', key)}")
+        deviations.append(Deviation(error=Fraction(0) if key in named else NO_CREDIT))
+        for place, number in term.where.items():
+            is_right = stated.get(place) == number
+            deviations.append(Deviation(error=Fraction(0) if is_right else NO_CREDIT))
+            if key in named and not is_right:
+                off.append(f"{key}: another {place}")
+        for parameter, value in zip(term.effect.parameters, term.values, strict=True):
+            if not parameter.reported:
+                continue
+            error = NO_CREDIT
+            if (typed := stated.get(parameter.name)) is not None:
+                sign = 1 if value > 0 else -1
+                error = percent_off(sign * typed, Reference.at(abs(value)), sigmas=0.0)
+            deviations.append(Deviation(error=error))
+            if key in named and points_for_one(criterion, deviations[-1]) < 1:
+                said = "not reported" if typed is None else as_typed(typed)
+                off.append(f"{key}: {parameter.name} is {said}")
+    for key in named.keys() - hidden.keys():
+        deviations.append(Deviation(error=NO_CREDIT))
+        off.append(f"{key}: your bench does not have it")
+    share = points_for(criterion, deviations) if deviations else ALL
+    return Verdict(
+        share=share,
+        models=(tuple(deviations),) if deviations else (),
+        message=f"{'; '.join(off[:_NAMED])}." if off else "The effects of your bench are named.",
+        expected={key: {**term.where, **term.parameters} for key, term in hidden.items()},
+        found={key: {n: float(v) for n, v in one.items()} for key, one in named.items()},
+        agrees={key: not any(text.startswith(key) for text in off) for key in named},
+    )
+
+
 def _manual(_criterion: asked.Manual, _work: GradingContext) -> Verdict:
     return Verdict(share=None, message="Graded by a person; not yet.")
 
@@ -313,6 +360,7 @@ _JUDGES: Mapping[str, Callable[[Any, GradingContext], Verdict]] = {
     "claims": judge_claims,
     "prefilter": judge_prefilter,
     "hardware": judge_hardware,
+    "effects": _effects,
     "manual": _manual,
 }
 

@@ -16,6 +16,7 @@ from pipeline.grading.reference import References, readings
 from pipeline.grading.rubric import RequiredPieces, RequiredRuns, Rubric, matching
 from pipeline.grading.tolerance import ALL, NONE, Deviation, mean_share
 from pipeline.names import read_name
+from pipeline.plant.effect import EffectTerm
 from pipeline.results import Analysis, ExperimentKind, Finding
 from pipeline.submission import (
     Experiment,
@@ -77,6 +78,7 @@ class GradingContext:
     meant : the gains that were meant, if a known mistake explains the reported ones, shape (2n,).
     order : the order of the states in which A and B are meant.
     gains_order : the order in which the gains are meant, if it is not x1, v1, x2, v2, …
+    effects : the effects of the team's bench in an answer key; None if they are not known.
     left : the mistakes that are left in the numbers; None for all, so that numbers are as typed.
     """
 
@@ -92,6 +94,7 @@ class GradingContext:
     order: Order
     gains_order: Order | None = None
     meant: Array | None = None
+    effects: Sequence[EffectTerm] | None = None
     left: Collection[Slip] | None = None
 
     def numbers(self, label: Label) -> dict[str, Number]:

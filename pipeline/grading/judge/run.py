@@ -212,9 +212,10 @@ def _prepare(
         per_count=submission.system.position.per_count,
     )
     references = in_doubt(measured, analysis=analysis)
-    bad, is_own = find_bad_recordings(analysis), True
+    bad, is_own, effects = find_bad_recordings(analysis), True, None
     if bench:
         true = TrueBench.read(bench, submission.system)
+        effects = true.effects
         is_own = true.shows_in(measured)
         references = true.references(references, is_own=is_own)
         chain = true.chain if true.is_linear or not is_own else chain
@@ -258,6 +259,7 @@ def _prepare(
         slipped=diagnosis.slipped,
         order=order,
         gains_order=gains_order,
+        effects=effects,
     )
     return work, diagnosis.flags
 
