@@ -200,5 +200,6 @@ def test_an_effect_that_cannot_be_read_costs_itself(tmp_path, stated, name):
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
     submission = load_submission(tmp_path)
     assert [one.at for one in submission.unread] == [("reported", "effects", name)]
-    assert submission.reported and submission.reported.effects
+    assert submission.reported
+    assert submission.reported.effects
     assert submission.reported.effects["input_delay"] == {"delay": Decimal("0.01")}
