@@ -132,6 +132,15 @@ def omega_names(suffixes: Iterable[str]) -> list[str]:
     return [f"omega_{suffix}" for suffix in suffixes]
 
 
+def derived_names(n: int) -> list[str]:
+    """Return the parameters of n carts that follow from the others, if there are any.
+
+    These are the frequencies and dampings of each cart alone, but for the last cart.
+    """
+    carts = range(1, n) if n in (2, 3) else ()
+    return [f"{symbol}_{cart}" for cart in carts for symbol in ("omega", "zeta")]
+
+
 def parameter_names(n: int, *, rigid: bool = False) -> list[str]:
     """Return the names of all parameters of n carts, in the order of the paper's tables."""
     if n == 1:

@@ -5,6 +5,7 @@ import json
 from pipeline.errors import ConfigError
 from pipeline.gap.types import Gap
 from pipeline.grading.grade import Grade
+from pipeline.grading.rubric import Rubric
 from pipeline.grading.self_check.answers import CheckAnswer
 from pipeline.json_files import json_schema
 from pipeline.report.solution.expected import Solution
@@ -16,6 +17,7 @@ MODELS: dict[str, type] = {
     "solution": Solution,
     "grade": Grade,
     "check": CheckAnswer,
+    "rubric": Rubric,
 }
 
 

@@ -1,6 +1,7 @@
 """The JSON files and their schemas: the shipped schemas describe the files we write."""
 
 import json
+import tomllib
 from typing import Any
 
 import jsonschema
@@ -10,6 +11,7 @@ from pipeline.errors import ConfigError
 from pipeline.gap.types import read_gap
 from pipeline.json_files import DIALECT, json_text
 from pipeline.report.solution.expected import solution_text
+from pipeline.resources import RUBRICS
 from pipeline.schemas import MODELS, schema_text
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.commandline import cartlab_here
@@ -112,3 +114,14 @@ def test_the_command_prints_the_schema():
     assert done.stdout == (DOCS / "gap.schema.json").read_text(encoding="utf-8")
     with pytest.raises(ConfigError, match="there are results, gap, solution, grade"):
         schema_text("report")
+
+
+@pytest.mark.parametrize("path", sorted(RUBRICS.glob("*.toml")), ids=lambda path: path.stem)
+def test_shipped_rubrics_obey_their_schema(path):
+    """The schema of a rubric takes the shipped ones as they are typed, and refuses a wrong key."""
+    validator = jsonschema.Draft202012Validator(json.loads(schema_text("rubric")))
+    rubric = tomllib.loads(path.read_text(encoding="utf-8"))
+    validator.validate(rubric)
+    for wrong in ({"from": "mine"}, {"points": "two"}, {"sigma": 3}):
+        criteria = [{**rubric["criteria"][0], **wrong}, *rubric["criteria"][1:]]
+        assert not validator.is_valid({**rubric, "criteria": criteria})

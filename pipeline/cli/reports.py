@@ -499,10 +499,10 @@ def effects(
 @app.command()
 def schema(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="results, gap, solution, grade or check.")
+        str, typer.Argument(metavar="NAME", help="results, gap, solution, grade, check or rubric.")
     ] = "results",
 ) -> None:
-    """Print the JSON Schema of results.json, gap.json, solution.json, grade.json or a check."""
+    """Print the JSON Schema of a result file, of a check, or of a rubric."""
     from pipeline.schemas import schema_text
 
     typer.echo(schema_text(name), nl=False)

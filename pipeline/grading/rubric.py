@@ -172,6 +172,37 @@ class _Graded(_Criterion):
     damping_none_percent: Percent = 150.0
 
 
+From = Literal["own", "recordings", "either"]
+
+
+class _FromModel(
+    create_model("_ModelSource", __base__=_Criterion, **dict[str, Any]({"from": (From, "either")}))
+):
+    """A criterion of numbers that follow from a model of the carts.
+
+    `from` says which model counts: the one of the student's own final table, the one of the
+    recordings, or the better of the two.
+    """
+
+
+class _FromTable(
+    create_model(
+        "_TableSource",
+        __base__=_Graded,
+        **dict[str, Any]({"from": (Literal["own", "recordings"], "recordings")}),
+    )
+):
+    """A criterion of numbers of a table.
+
+    With `from = "own"`, they are compared with what the other numbers of the same table give.
+    """
+
+
+def source_of(criterion: "Criterion") -> From:
+    """Return what the numbers of a criterion are judged by."""
+    return getattr(criterion, "from", "recordings")
+
+
 class RequiredPieces(_Criterion):
     """Check how many of the items in `[required]` are present; points are in proportion.
 
@@ -194,8 +225,8 @@ class DataQuality(_Criterion):
     check: Literal["data"]
 
 
-class Parameters(_Graded):
-    """Compare reported parameters with those computed from the student's own recordings."""
+class Parameters(_FromTable):
+    """Compare reported parameters with those of the recordings, or of the rest of the table."""
 
     check: Literal["initial", "final"]
     parameters: tuple[str, ...] = ("*",)
@@ -227,7 +258,7 @@ class Laws(_Criterion):
     damping_percent: Percent = 30.0
 
 
-class StateModel(_Graded):
+class StateModel(_FromModel, _Graded):
     """Compare each entry of A and B with the student's own final table, or with the reference.
 
     Attributes
@@ -240,7 +271,7 @@ class StateModel(_Graded):
     states: tuple[str, ...] = ()
 
 
-class Gains(_Criterion):
+class Gains(_FromModel):
     """Simulate the gains on the carts: they must be stable and meet the design goal.
 
     The errors are the overshoot above the goal, in percentage points, and the settling time above
@@ -254,7 +285,7 @@ class Gains(_Criterion):
     settling_none_percent: Percent = 150.0
 
 
-class Claims(_Criterion):
+class Claims(_FromModel):
     """Compare the reported overshoot and settling time with a simulation of the reported gains."""
 
     check: Literal["claims"]
@@ -264,7 +295,7 @@ class Claims(_Criterion):
     settling_none_percent: Percent = 100.0
 
 
-class Prefilter(_Criterion):
+class Prefilter(_FromModel):
     """Compare the prefilter with the reciprocal of the loop's static gain."""
 
     check: Literal["prefilter"]

@@ -21,8 +21,9 @@ from pipeline.grading.rubric import (
     Rubric,
     StateModel,
     matching,
+    source_of,
 )
-from pipeline.names import read_name
+from pipeline.names import derived_names, read_name
 from pipeline.resources import RUBRICS
 from pipeline.submission.load import spring_names
 from pipeline.submission.toml import (
@@ -285,6 +286,16 @@ def _contradictions(found: Rubric, ids: Sequence[object]) -> Iterator[tuple[Loca
         named = criterion.states if isinstance(criterion, StateModel) else ()
         if named and sorted(named) != sorted(states):
             yield ("criteria", i, "states"), f"needs each of {', '.join(states)} once"
+        if isinstance(criterion, Parameters) and source_of(criterion) == "own":
+            derived = derived_names(n)
+            for name in matching(criterion.parameters, names):
+                if name not in derived:
+                    known = f", as {', '.join(derived)} do" if derived else ""
+                    what = (
+                        f'{name} does not follow from the other numbers{known}: remove from = "own"'
+                    )
+                    yield ("criteria", i, "parameters"), what
+                    break
         if isinstance(criterion, Parameters | InitialFinal):
             for pattern in criterion.parameters:
                 if not matching((pattern,), names):

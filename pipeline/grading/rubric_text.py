@@ -8,6 +8,7 @@ from pipeline.grading.rubric import (
     Required,
     Rubric,
     matching,
+    source_of,
 )
 from pipeline.names import read_name
 from pipeline.report.html import render_text
@@ -47,6 +48,7 @@ def rubric_text(rubric: Rubric) -> str:
         costs={code: cost for code, cost in rubric.flags if cost.least or cost.most < 1},
         nothing=rubric.required == Required(),
         named=named,
+        source=source_of,
         dampings=dampings,
         others=others,
     )

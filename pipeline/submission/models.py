@@ -16,8 +16,16 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 # A line that any page can show; pages and PDF readers fail with very long texts.
 Line = Annotated[str, Field(max_length=200)]
-# Units appear in the titles of figures, so they may not contain invisible characters.
-Unit = Annotated[str, Field(max_length=40, pattern=r"^[^\p{C}\p{Zl}\p{Zp}]*$")]
+# Units appear in the titles of figures, so they may not contain invisible characters. Not every
+# program knows such a pattern, so it is left out of the schema.
+Unit = Annotated[
+    str,
+    Field(
+        max_length=40,
+        pattern=r"^[^\p{C}\p{Zl}\p{Zp}]*$",
+        json_schema_extra=lambda schema: schema.__delitem__("pattern"),
+    ),
+]
 MOST_CARTS = 4
 MOST_EXPERIMENTS = 1_000  # limits the time of stages and comparisons
 # A number with its digits as typed: 0.10 has two.

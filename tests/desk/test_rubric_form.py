@@ -11,6 +11,7 @@ import pytest
 
 from pipeline.desk.instructor.rubric_list import own_rubrics
 from pipeline.desk.users import User
+from pipeline.grading.rubric import source_of
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS
 from tests.helpers.desks import Answer, Visitor, at_desk, wrongs
@@ -260,3 +261,14 @@ def test_a_preview_needs_an_open_class_and_a_valid_rubric(visitor, lab):
     assert visitor.post("/rubric/preview", **spoilt, **{"class": "0"}).status == 422
     for query in ("", "before=1", "before=1.2&after=1.2.3", "before=1.x&after=1.2"):
         assert visitor.get(f"/rubric/preview.svg?{query}").status == 404
+
+
+def test_the_form_chooses_what_judges_a_criterion(visitor, lab):
+    """A choice of the form becomes the key `from` of its criterion; others stay as they are."""
+    page = editor(visitor, lab)
+    fields = sent(page, lab, **{"criteria.state-model.from": "own"})
+    assert visitor.post("/rubric/save", **fields).status == 303
+    sources = {one.id: source_of(one) for one in load_rubric(lab).criteria}
+    assert (sources["state-model"], sources["prefilter"]) == ("own", "either")
+    assert lab.read_text("utf-8").count("from = ") == 1
+    assert json.loads(unescape(editor(visitor, lab).value("shown")))["criteria.state-model.from"]

@@ -44,6 +44,7 @@ class CriterionFields:
     Attributes
     ----------
     tolerances : the field of each tolerance by its key, in the order of the rubric.
+    source : the field of `from`; None if the criterion has no such key.
     """
 
     id: str
@@ -51,6 +52,7 @@ class CriterionFields:
     check: str
     points: Field
     tolerances: Mapping[str, Field]
+    source: Field | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +80,7 @@ class RubricForm:
         for criterion in self.criteria:
             yield criterion.points
             yield from criterion.tolerances.values()
+            yield from [criterion.source] if criterion.source else []
         yield from self.late.values()
         yield from self.costs.values()
         yield self.step
@@ -94,7 +97,12 @@ class RubricForm:
 
         return RubricForm(
             criteria=tuple(
-                replace(one, points=now(one.points), tolerances=all_now(one.tolerances))
+                replace(
+                    one,
+                    points=now(one.points),
+                    tolerances=all_now(one.tolerances),
+                    source=now(one.source) if one.source else None,
+                )
                 for one in self.criteria
             ),
             late=all_now(self.late),
@@ -129,7 +137,15 @@ def _criterion(index: int, own: asked.Criterion, names: list[str]) -> CriterionF
         amount = _amount(f"criteria.{index}.{key}", getattr(own, key))
         return replace(amount, input=f"criteria.{own.id}.{key}")
 
+    source = None
+    if "from" in type(own).model_fields:
+        path, name = f"criteria.{index}.from", f"criteria.{own.id}.from"
+        empty = describe_field("from", type(own))
+        choices = tuple(filter(None, empty.choices))
+        value = asked.source_of(own)
+        source = replace(empty, path=path, input=name, choices=choices, value=value)
     return CriterionFields(
+        source=source,
         id=own.id,
         title=own.title or own.id,
         check=own.check,

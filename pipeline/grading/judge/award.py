@@ -251,7 +251,7 @@ def _outcome(share: Fraction | None, points: Fraction, *, out_of: Fraction) -> O
 # again.
 _OF_RUBRIC = ("system", "design", "required", "examples")
 _OF_CRITERION = (
-    "check", "experiments", "parameters", "sigmas", "frequency_percent", "damping_percent",
+    "check", "from", "experiments", "parameters", "sigmas", "frequency_percent", "damping_percent",
 )  # fmt: skip
 
 

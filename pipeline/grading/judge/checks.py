@@ -26,7 +26,7 @@ from pipeline.grading.judge.context import (
     share_sound,
     share_there,
 )
-from pipeline.grading.mistakes.state_model import model_harm, order_names
+from pipeline.grading.mistakes.state_model import OWN, derived_numbers, model_harm, order_names
 from pipeline.grading.mistakes.undo import Number
 from pipeline.grading.reference import OFF_SCALE, Reference, is_linear, off_scale
 from pipeline.grading.rubric import matching
@@ -119,11 +119,16 @@ def _parameters(criterion: asked.Parameters, context: GradingContext) -> Verdict
     """
     table = context.numbers(criterion.check)
     known: Mapping[str, Reference] = getattr(context.references, criterion.check)
+    by_own = asked.source_of(criterion) == OWN
+    if by_own:
+        known = derived_numbers(table, n=context.rubric.system.carts)
+        if not known:
+            return Verdict(share=None, message="Not checked: the table is not complete.")
     names = matching(criterion.parameters, context.rubric.names)
     impossible = [name for name, number in table.items() if number.value <= 0]
     judged = [n for n in names if n in known or n in impossible]
     guessed = [n for n in names if n not in known and n not in judged]
-    needs = lacking(context) if criterion.check == "initial" else {}
+    needs = lacking(context) if criterion.check == "initial" and not by_own else {}
     unproved = {n: f"no usable {needs[n]}" for n in judged if n in needs and n in table}
     if unproved and len(unproved) == len(judged):
         why = "; ".join(group_messages(unproved.items()))
@@ -162,8 +167,10 @@ def _parameters(criterion: asked.Parameters, context: GradingContext) -> Verdict
         if guessed and criterion.check == "final"
         else ""
     )
-    loose = any(n in known for n in judged) and not is_linear(context.analysis)
+    loose = any(n in known for n in judged) and not by_own and not is_linear(context.analysis)
     right = WORDS.text("agrees_loosely" if loose else "agrees")
+    if by_own:
+        right = "They follow from your other numbers."
     message = f"{'; '.join(off[:_NAMED])}." if off else right
     if unproved:
         left += f" Not checked, so without points: {'; '.join(group_messages(unproved.items()))}."
@@ -180,7 +187,8 @@ def _parameters(criterion: asked.Parameters, context: GradingContext) -> Verdict
 
 
 def _whose(reference: Reference) -> str:
-    return "your bench has" if reference.source == SOURCE else "your recordings give"
+    by_source = {SOURCE: "your bench has", OWN: "your other numbers give"}
+    return by_source.get(reference.source, "your recordings give")
 
 
 def _deviation(error: Fraction, name: str) -> Deviation:
@@ -264,7 +272,8 @@ def _state_space(criterion: asked.StateModel, context: GradingContext) -> Verdic
         why = [context.because_unread("state_space", n) for n in "AB"]
         told = "".join(dict.fromkeys(why))
         return Verdict(share=NONE, message=f"A and B are not both reported.{told}")
-    if not (entries := context.entries):
+    models = context.models_from(asked.source_of(criterion))
+    if not (entries := context.entries_from(models)):
         return Verdict(share=None, message="Not checked: there is no table or fit to compare with.")
     deviations = tuple(
         Deviation(error=e.error, by="number" if e.kind == "stiffness" else e.kind) for e in entries
@@ -277,9 +286,7 @@ def _state_space(criterion: asked.StateModel, context: GradingContext) -> Verdic
     message = f"{named}." if off else "A and B follow from the table."
     springs = context.analysis.bench.springs
     n, tied = len(springs) - 1, springs[0] or springs[-1]
-    harm = model_harm(
-        space, entries, models=context.state_models, n=n, tied=tied, order=context.order
-    )
+    harm = model_harm(space, entries, models=models, n=n, tied=tied, order=context.order)
     most = limits.KEPT_IF_HARMFUL if harm else ALL
     if harm:
         message = f"{WORDS.text(f'model_{harm}')} {message}"

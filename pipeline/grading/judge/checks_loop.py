@@ -32,7 +32,9 @@ from pipeline.words.text import sentence
 Judged = Callable[[LoopNumbers], tuple[Deviation, ...]]
 
 
-def _loop(context: GradingContext) -> tuple[Controller, Array] | Verdict:
+def _loop(
+    context: GradingContext, criterion: asked.Gains | asked.Claims | asked.Prefilter
+) -> tuple[Controller, Array] | Verdict:
     """Return the controller and its gains, or a verdict that says why they cannot be judged."""
     feedback = context.reported.feedback
     if feedback is None or not feedback.gains:
@@ -40,7 +42,12 @@ def _loop(context: GradingContext) -> tuple[Controller, Array] | Verdict:
         return Verdict(share=NONE, message=f"No gains are reported.{why}")
     if context.controller is None or context.controller.gains is None:
         return Verdict(share=None, message="Not checked: the carts were not identified.")
-    return context.controller, context.controller.gains
+    controller = context.controller.judged_from(asked.source_of(criterion))
+    if not controller.models:
+        own = "your final table is not complete, so it gives no model"
+        why = own if asked.source_of(criterion) == "own" else "the carts were not identified"
+        return Verdict(share=None, message=f"Not checked: {why}.")
+    return controller, context.controller.gains
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +83,7 @@ def judge_gains(criterion: asked.Gains, context: GradingContext) -> Verdict:
 
     If several models are acceptable, the one with the best result counts.
     """
-    loop = _loop(context)
+    loop = _loop(context, criterion)
     if isinstance(loop, Verdict):
         return loop
     controller, gains = loop
@@ -126,7 +133,7 @@ def _claimable(numbers: LoopNumbers) -> dict[str, float | None]:
 
 def judge_claims(criterion: asked.Claims, context: GradingContext) -> Verdict:
     """Judge the reported overshoot and settling time by a simulation with the reported gains."""
-    loop = _loop(context)
+    loop = _loop(context, criterion)
     if isinstance(loop, Verdict):
         return loop
     controller, gains = loop
@@ -165,7 +172,7 @@ def judge_claims(criterion: asked.Claims, context: GradingContext) -> Verdict:
 
 def judge_prefilter(criterion: asked.Prefilter, context: GradingContext) -> Verdict:
     """Judge the prefilter against the reciprocal of the loop's static gain."""
-    loop = _loop(context)
+    loop = _loop(context, criterion)
     if isinstance(loop, Verdict):
         return loop
     controller, gains = loop

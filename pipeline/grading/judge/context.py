@@ -137,10 +137,19 @@ class GradingContext:
 
         Empty if A is not reported.
         """
+        return self.entries_from(self.state_models)
+
+    def models_from(self, source: str) -> Sequence[StateMatrices]:
+        """Return the acceptable [A B] of one source: "own", "recordings" or "either"."""
+        every = self.state_models
+        return [m for m in every if source == "either" or m.own == (source == "own")]
+
+    def entries_from(self, models: Sequence[StateMatrices]) -> list[MatrixEntry]:
+        """Return the reported entries of A and B with the values that some models accept."""
         space, n = self.reported.state_space, self.rubric.system.carts
         if space is None or not space.A:
             return []
-        return compare_entries(space, models=self.state_models, n=n, order=self.order)
+        return compare_entries(space, models=models, n=n, order=self.order)
 
     @property
     def reported(self) -> Reported:

@@ -155,6 +155,13 @@ class Controller:
     reference: Chain | None
     doubt: float = 0.0
 
+    def judged_from(self, source: str) -> "Controller":
+        """Return the controller with only the models of one source: "own" or "recordings"."""
+        n_first = 0 if self.reference is None else 1
+        if source == "own":
+            return replace(self, models=self.models[n_first:])
+        return self if source == "either" else replace(self, models=self.models[:n_first])
+
     def numbers(self, gains: Array) -> list[LoopNumbers]:
         """Return the simulated loop with some gains, one for each model."""
         found = [self._on(chain, gains) for chain in self.models]

@@ -13,10 +13,11 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.grading import limits
 from pipeline.grading.grade import Flag
+from pipeline.grading.mistakes.undo import Number
 from pipeline.grading.reference import Reference
 from pipeline.grading.tolerance import percent_off
 from pipeline.grading.words import WORDS
-from pipeline.names import parameter_names, read_name
+from pipeline.names import derived_names, parameter_names, read_name
 from pipeline.plant.chain import Chain
 from pipeline.plant.identities import recover_from_parameters
 from pipeline.submission import ReportedStateSpace
@@ -24,6 +25,7 @@ from pipeline.submission import ReportedStateSpace
 EntryKind = Literal["exact", "stiffness", "damping"]
 
 _NAMED = 3  # largest number of carts whose named parameters determine the chain
+OWN = "own"  # the source of a reference that follows from the student's other numbers
 _MODES = ("omega_a", "omega_b", "omega_c")
 _NULLS = ("omega_x", "omega_y")
 
@@ -36,10 +38,12 @@ class StateMatrices:
     ----------
     right : the right entries; NaN if unknown.
     slack : uncertainty of each entry.
+    own : whether it follows from the student's own table.
     """
 
     right: Array
     slack: Array
+    own: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +197,8 @@ def state_models(
             slack = _spread(make, values, right, rounding=rounding, n=n)
             if values is reference:
                 _put_dampings(right, slack, values, known=known)
-            models.append(StateMatrices(right=right, slack=slack))
+            own = values is not reference
+            models.append(StateMatrices(right=right, slack=slack, own=own))
     return models
 
 
@@ -313,6 +318,32 @@ def own_chain(values: Mapping[str, float], *, n: int) -> Chain | None:
         return None
     finite = np.all(np.isfinite([*chain.m, *chain.c, *chain.k]))
     return chain if finite and np.all(chain.m > 0) else None
+
+
+def derived_numbers(values: Mapping[str, Number], *, n: int) -> dict[str, Reference]:
+    """Return the numbers of a table that follow from its others; none if the table is incomplete.
+
+    Their bounds allow for the rounding of the others.
+    """
+    typed = {name: float(number.value) for name, number in values.items()}
+    chain = own_chain(typed, n=n)
+    if chain is None:
+        return {}
+    right = chain.parameters()
+    names = derived_names(n)
+    slack = dict.fromkeys(names, 0.0)
+    for name in right.keys() - set(names):
+        shifted = own_chain({**typed, name: typed[name] + float(values[name].rounding)}, n=n)
+        moved = shifted.parameters() if shifted else right
+        for one in names:
+            slack[one] += abs(moved[one] - right[one])
+    return {
+        name: Reference(
+            value=right[name], low=right[name] - slack[name], high=right[name] + slack[name],
+            std=0.0, source=OWN,
+        )
+        for name in names
+    }  # fmt: skip
 
 
 def _kinds(n: int) -> list[list[EntryKind]]:
