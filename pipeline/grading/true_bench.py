@@ -61,7 +61,7 @@ class TrueBench:
         )
 
     def shows_in(self, measured: References) -> bool:
-        """Return whether recordings are of this bench: half of their numbers agree with it."""
+        """Return whether recordings are of this bench: three of four numbers agree with it."""
         expected = {**self.parameters, **self.found}
         apart = [
             abs(np.log(one.value / expected[name]))
@@ -69,7 +69,7 @@ class TrueBench:
             if name in expected and not read_name(name).is_damping and one.value > 0
         ]
         limit = limits.OTHER_BENCH if self.is_linear else limits.OTHER_BENCH_WITH_EFFECTS
-        return not apart or bool(np.median(apart) <= np.log(limit))
+        return not apart or bool(np.percentile(apart, 75) <= np.log(limit))
 
     def references(self, references: References, *, is_own: bool) -> References:
         """Return references at the true values.

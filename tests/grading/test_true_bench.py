@@ -98,6 +98,7 @@ def test_bounds_are_those_of_the_own_bench():
     others = measured({"K": 1.2 * K, "omega_n": 1.1 * omega})
     assert true.shows_in(own)
     assert not true.shows_in(others)
+    assert not true.shows_in(measured({"K": K, "omega_n": 1.1 * omega}))  # half agree by chance
     judged = true.references(own, is_own=True).final["K"]
     assert (judged.value, judged.high, judged.source) == (K, 1.01 * K, SOURCE)
     judged = true.references(others, is_own=False).final["K"]
