@@ -87,22 +87,24 @@ def exploration(team: Path) -> None:
         sync_playwright() as playwright,
     ):
         assert bench.stderr is not None
-        address = next(line.split()[-1] for line in bench.stderr if line.startswith("ready: "))
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
-        page = browser.new_page(viewport=WINDOW)
-        page.goto(server.url)
-        page.get_by_role("link", name="Bench").click()
-        page.get_by_text("Explore: the bench records").click()
-        page.locator("#explore-port").select_option(address)
-        page.get_by_label("Accuracy to reach, ± %").fill("0.01")
-        page.get_by_role("button", name="Explore").click()
-        page.locator("#thought:not([hidden])").wait_for(timeout=1e5)
-        page.locator("#status", has_text="Recording").wait_for(timeout=1e5)
-        page.wait_for_timeout(1e3)
-        page.locator(".kicker").first.evaluate("it => { it.textContent = 'lab/bench-5' }")
-        page.screenshot(path=IMAGES / "desk-explore.png")
-        browser.close()
-        bench.terminate()
+        try:
+            address = next(line.split()[-1] for line in bench.stderr if line.startswith("ready: "))
+            browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
+            page = browser.new_page(viewport=WINDOW)
+            page.goto(server.url)
+            page.get_by_role("link", name="Bench", exact=True).click()
+            page.get_by_text("Explore: the bench records").click()
+            page.locator("#explore-port").select_option(address)
+            page.get_by_label("Accuracy to reach, ± %").fill("0.01")
+            page.get_by_role("button", name="Explore").click()
+            page.locator("#thought:not([hidden])").wait_for(timeout=1e5)
+            page.locator("#status", has_text="Recording").wait_for(timeout=1e5)
+            page.wait_for_timeout(1e3)
+            page.locator(".kicker").first.evaluate("it => { it.textContent = 'lab/bench-5' }")
+            page.screenshot(path=IMAGES / "desk-explore.png")
+            browser.close()
+        finally:
+            bench.terminate()
 
 
 def desk(team: Path, grades: Path) -> None:
