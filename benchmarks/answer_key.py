@@ -20,8 +20,9 @@ from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.judge.award import read_findings, recompute_points
 from pipeline.grading.rubric import Rubric
+from pipeline.json_files import json_text
 from pipeline.resources import RUBRICS
-from pipeline.simulated.answer_key import changing_key, draw_bench
+from pipeline.simulated.answer_key import AnswerKey, changing_key, draw_bench
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.simulated.submission import Students, write_submission
 
@@ -70,7 +71,9 @@ def with_tolerances(rubric: Rubric) -> Rubric:
 def _hand_in(folder: Path, *, teams: int) -> None:
     """Write the submissions of a class, and the answer key beside them."""
     bench, names = prepare_bench(preset=PRESET), [f"team-{i:03d}" for i in range(teams)]
-    with changing_key(folder / "key.json") as key:
+    key_file = folder / "key.json"
+    key_file.write_text(json_text(AnswerKey(secret=PRESET, teams={})), "utf-8")  # always the same
+    with changing_key(key_file) as key:
         for name in names:
             rng = key.generator(name, seed=0)
             own, answers = draw_bench(bench, percent=20, rng=rng)
