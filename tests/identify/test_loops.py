@@ -1,6 +1,7 @@
 """The step, margins and gains of a designed loop are checked with python-control."""
 
 from dataclasses import replace
+from typing import Literal
 
 import control
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.errors import DataError
-from pipeline.estimation.state_feedback import Method, design_feedback
+from pipeline.estimation.state_feedback import design_feedback
 from pipeline.identify.model_checks import design_margins, verify_design
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.plant.margins import Margins, closed_loop, stability_margins
@@ -27,7 +28,11 @@ PACES = [(None, 1.0), (1e-4, 1.0), (None, 30.0), (0.02, 0.3)]
 
 
 def designed(
-    chain: Chain, method: Method, *, sample_time: float | None = None, settling_time: float = 1.0
+    chain: Chain,
+    method: Literal["poles", "lqr"],
+    *,
+    sample_time: float | None = None,
+    settling_time: float = 1.0,
 ) -> tuple[FeedbackDesign, StateFeedback]:
     design = design_feedback(
         chain,

@@ -138,7 +138,7 @@ def test_fill_is_not_sure_of_springs_if_steps_contradict_each_other(factors, tmp
     for i, factor in enumerate(factors):
         record = step([SPRING, SPRING, 0], seconds=8.0 + i)
         y = np.round(record.y / factor / STEP) * STEP
-        rows = np.column_stack([record.t, record.u, *y])
+        rows = np.column_stack([record.t, record.input, *y])
         file = tmp_path / "data" / f"step-{i}.csv"
         np.savetxt(file, rows, delimiter=",", header="time,input,x1 [cm],x2 [cm]", comments="")
     doubts = fill_folder(tmp_path).doubts

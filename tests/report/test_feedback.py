@@ -5,13 +5,14 @@ import re
 from dataclasses import replace
 from functools import partial
 from html import unescape
+from typing import Literal
 
 import control
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.estimation.state_feedback import Method, design_feedback
+from pipeline.estimation.state_feedback import design_feedback
 from pipeline.identify.log import Log
 from pipeline.identify.model_checks import design_margins
 from pipeline.json_files import json_text
@@ -39,7 +40,9 @@ CASES = [
 ]
 
 
-def with_design(chain: Chain, method: Method, pace: tuple[float | None, float]) -> Analysis:
+def with_design(
+    chain: Chain, method: Literal["poles", "lqr"], pace: tuple[float | None, float]
+) -> Analysis:
     """Return an analysis with a chain and a design for it, as the workflow makes them."""
     analysis = make_analysis(min(chain.n, 3))
     assert analysis.fit is not None

@@ -34,7 +34,14 @@ from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.effect import AugmentedChain, effect_name, input_steps
 from pipeline.plant.simulator.generated_forces import shaped_input
 from pipeline.report.builder import Page as ReportPage
-from pipeline.report.document import Document, Formula, paragraph, plain_lines
+from pipeline.report.document import (
+    Document,
+    Formula,
+    Picture,
+    Table,
+    paragraph,
+    plain_lines,
+)
 from pipeline.report.equations.model import augmented_equations, in_order, law
 from pipeline.report.figures.gap import predicted_figure
 from pipeline.report.files import write_files
@@ -554,6 +561,8 @@ def test_many_closed_loops_are_one_figure_and_a_table():
     table, picture = augmented_hardware_blocks(
         ReportPage(analysis), make_gap("named", ("coulomb_friction",))
     )[1:]
+    assert isinstance(table, Table)
+    assert isinstance(picture, Picture)
     assert [plain(row[0].text) for row in table.rows] == [n for n in names for _ in checks]
     drawn = picture.svg
     assert [name for name in names if name in Page(drawn).text] == [names[0], names[-1]]

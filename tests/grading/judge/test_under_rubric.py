@@ -84,6 +84,7 @@ FULL = Submission(
             overshoot_percent=Decimal(3),
             settling_time=Decimal(4),
         ),
+        effects={"input_delay": {"delay": Decimal("0.01")}},
     ),
     students=Students(see="check"),
     folder=Path("somewhere"),
