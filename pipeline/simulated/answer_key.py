@@ -24,6 +24,7 @@ from pipeline.plant.effect import AugmentedChain, EffectTerm
 from pipeline.setup import Units
 from pipeline.simulated.bench import SimulatedBench
 from pipeline.submission.toml import nearest, read_text
+from pipeline.words.numbers import count
 
 MOST_PERCENT = 50.0  # a larger change may exchange the order of resonances
 _MOST_BYTES = 10_000_000
@@ -111,12 +112,17 @@ def bench_of_team(bench: SimulatedBench, *, team: str, key: Path) -> SimulatedBe
 
     Raises
     ------
-    ConfigError : the file is not an answer key, or has no bench for this team.
+    ConfigError : the file is not an answer key, or has no bench with so many carts for this team.
     """
     teams = read_key(key).teams
     if team not in teams:
         raise ConfigError(f"{key}: has no bench for {team!r}{nearest(team, [*teams])}")
     model = teams[team].model
+    if model.chain.n != bench.chain.n:
+        raise ConfigError(
+            f"{key}: the bench of {team} has {count(model.chain.n, 'cart')}, {bench.name} has "
+            f"{bench.chain.n}; name the preset that `simulate` had"
+        )
     return replace(bench, name=team, chain=model.chain, effects=model.terms, effect_sentences=())
 
 

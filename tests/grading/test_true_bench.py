@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import answer_key as copying
+from pipeline.errors import ConfigError
 from pipeline.grading import rubric as asked
 from pipeline.grading.gradings import HandIn
 from pipeline.grading.judge.checks import judge
@@ -20,7 +21,7 @@ from pipeline.json_files import json_text
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.effect import EffectTerm
 from pipeline.resources import RUBRICS
-from pipeline.simulated.answer_key import AnswerKey, TeamBench, draw_bench
+from pipeline.simulated.answer_key import AnswerKey, TeamBench, bench_of_team, draw_bench
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
@@ -204,3 +205,16 @@ def test_an_effect_that_cannot_be_read_costs_itself(tmp_path, stated, name):
     assert submission.reported
     assert submission.reported.effects
     assert submission.reported.effects["input_delay"] == {"delay": Decimal("0.01")}
+
+
+def test_a_virtual_bench_is_that_of_the_team(tmp_path):
+    """The emulator gets the team's carts and effects; another number of carts is refused."""
+    own = draw(1, "input_delay")[1]
+    key = tmp_path / "key.json"
+    key.write_text(json_text(AnswerKey(secret="0", teams={"a": own})), encoding="utf-8")
+    bench = bench_of_team(prepare_bench(preset="throne-1dof"), team="a", key=key)
+    assert json_text(bench.chain) == json_text(own.model.chain)
+    assert [term.effect.key for term in bench.effects] == ["input_delay"]
+    for preset, team in (("throne-2dof", "a"), ("throne-1dof", "b")):
+        with pytest.raises(ConfigError):
+            bench_of_team(prepare_bench(preset=preset), team=team, key=key)
