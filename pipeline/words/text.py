@@ -53,19 +53,24 @@ def plain(text: Spans) -> str:
 # -------------------------------------------------------------- parameter names inside sentences
 
 _NAME = re.compile(r"\b(?:omega|zeta|K|X|m|c|k)_(?:\d|[a-h]|[nxy])\b|\b(?:omega|zeta)\b")
-# What a file contains or should contain: "write omega_a = 10.1", 'omega_1', reported.final.omega_1.
-_CODE = re.compile(r"((?<=write |found )[\w-]+ [=:] [-+,.\w]*\w|'[^'\s]+'|\breported\.[\w.]*\w)")
+# What a file contains or should contain: "write omega_a = 10.1", 'omega_1', reported.final.omega_1,
+# leave_out = ["step-1"].
+_CODE = re.compile(
+    r"((?<=write |found )[\w-]+ [=:] [-+,.\w]*\w|'[^'\s]+'|\breported\.[\w.]*\w|\w+ = \[[^\]]*\])"
+)
 _BREAK = re.compile(r"(?<=\w[._-])(?=[^\W\d])")  # "zeta_1" stays whole
 
 
 def rich(text: str) -> Spans:
     """Return one of cartlab's sentences with names such as `omega_a` as mathematics.
 
-    Quotations from a file stay as they are typed.
+    Quotations from a file stay as they are typed; a line with a list is code, so that it can be
+    copied.
     """
     parts: list[Span] = []
     for i, piece in enumerate(_CODE.split(text)):
-        parts += [Span(piece)] if i % 2 else _with_math(typeset(piece))
+        quoted = Span(piece, style="code" if piece.endswith("]") else "plain")
+        parts += [quoted] if i % 2 else _with_math(typeset(piece))
     return tuple(part for part in parts if part.text)
 
 

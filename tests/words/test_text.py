@@ -26,3 +26,11 @@ def test_other_names_become_symbols():
     text = "omega_a: write omega_a = 10.1. Look at zeta_b, and at zeta_2 = -0.1."
     assert with_symbols(text) == "ω_a: write omega_a = 10.1. Look at ζ_b, and at ζ₂ = -0.1."
     assert [span.text for span in rich(text) if span.math] == ["ω_a", "ζ_b", "ζ_2"]
+
+
+def test_a_line_with_a_list_is_code():
+    """A line for submission.toml is shown as it must be typed."""
+    line = 'leave_out = ["07-Feb-2025_09", "*zeta_1*"]'
+    assert [s.text for s in rich(f"of zeta_1: to keep (1), {line}; x") if s.style == "code"] == [
+        line
+    ]
