@@ -25,7 +25,7 @@ from pipeline.cli.common import (
     say,
     say_briefly,
 )
-from pipeline.errors import ConfigError, PipelineError
+from pipeline.errors import PipelineError
 from pipeline.second_process import SecondProcess
 from pipeline.words.progress import Progress
 
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from pipeline.report.changes import DraftChanges
     from pipeline.report.make_report import Files
     from pipeline.results import Analysis
-    from pipeline.simulated.bench import SimulatedBench
     from pipeline.submission import Submission
 
 
@@ -431,7 +430,14 @@ def simulate(
     new_folder(out)
     bench = prepare_bench(preset=preset, model=model, hide=hide or ())
     if vary is not None and secret is not None:
-        simulate_team(out, bench, percent=vary, secret=secret, seed=seed, reported=reported)
+        from pipeline.grading.true_bench import write_team
+
+        with progress_line() as progress:
+            write_team(
+                out, bench, percent=vary, key=secret, seed=seed, reported=reported,
+                progress=progress,
+            )  # fmt: skip
+        say(f"wrote {out}, and its true values to {secret}")
         return
     for sentence in bench.effect_sentences:
         say(f"hidden: {sentence}")
@@ -439,33 +445,6 @@ def simulate(
         progress("simulating the experiments")
         write_submission(out, bench, seed=seed, reported=reported)
     say(f"wrote {out}: try `cartlab report {out}`")
-
-
-def simulate_team(
-    out: Path, bench: "SimulatedBench", *, percent: float, secret: Path, seed: int, reported: bool
-) -> None:
-    """Write the submission of a team, whose bench only the answer key knows."""
-    from pipeline.grading.reference import recompute
-    from pipeline.simulated.answer_key import changing_key, draw_bench
-    from pipeline.simulated.submission import Students, write_submission
-    from pipeline.submission import load_submission
-    from pipeline.workflow import analyse
-
-    team = out.resolve().name
-    if secret.resolve().is_relative_to(out.resolve()):
-        raise ConfigError(f"--secret {secret}: is in the team's folder; students would read it")
-    with changing_key(secret) as key, progress_line() as progress:
-        rng = key.generator(team, seed=seed)
-        own, answers = draw_bench(bench, percent=percent, rng=rng)
-        key.enter(team, answers)
-        progress("simulating the experiments")
-        noise = int(rng.integers(2**63))
-        students = Students(title="Identification of carts on springs", is_anonymous=True)
-        write_submission(out, own, seed=noise, reported=reported, students=students)
-        analysis = analyse(load_submission(out), design=False, progress=progress)
-        found = {name: one.value for name, one in recompute(analysis).final.items()}
-        key.teams[team] = replace(answers, found=found)
-    say(f"wrote {out}, and its true values to {secret}")
 
 
 @app.command()

@@ -86,13 +86,20 @@ def make_exercises(
     out: str,
     seeds: Sequence[int],
     reported: bool,
+    vary: float,
     *,
     progress: Progress,
 ) -> list[str]:
     """Write an exercise for each seed; return the folders.
 
     With one seed the exercise is in `out`; with several, each is in a subfolder of `out`.
+
+    Parameters
+    ----------
+    vary : by how many percent the bench of each exercise may differ; the true values are then in
+        `key_of(out)`.
     """
+    from pipeline.grading.true_bench import write_team
     from pipeline.simulated.submission import write_submission
 
     hidden, root = _prepare(bench, hide), new_folder(Path(out))
@@ -100,8 +107,19 @@ def make_exercises(
     made = [root / f"{i + 1:0{len(str(count))}d}" for i in range(count)] if count > 1 else [root]
     for i, (folder, seed) in enumerate(zip(made, seeds, strict=True)):
         progress(f"exercise {i + 1} of {count}")
-        write_submission(folder, hidden, seed=seed, reported=reported)
+        if vary:
+            write_team(
+                folder, hidden, percent=vary, key=key_of(root), seed=seed, reported=reported,
+                progress=progress,
+            )  # fmt: skip
+        else:
+            write_submission(folder, hidden, seed=seed, reported=reported)
     return [str(folder) for folder in made]
+
+
+def key_of(out: Path) -> Path:
+    """Return the path of the answer key of exercises: beside them, where no student gets it."""
+    return out.with_name(f"{out.name}-key.json")
 
 
 def describe_hidden(bench: Mapping[str, str], hide: Sequence[str]) -> list[str]:

@@ -6,21 +6,28 @@ A number that somebody copies from another team is then wrong, whatever the reco
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import TypeAdapter
 
+from pipeline.errors import ConfigError
 from pipeline.grading import limits
 from pipeline.grading.gradings import HandIn
-from pipeline.grading.reference import Reference, References
+from pipeline.grading.reference import Reference, References, recompute
 from pipeline.ingest.columns import conversion
 from pipeline.json_files import json_text
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import EffectTerm
 from pipeline.results import Analysis, Finding
-from pipeline.simulated.answer_key import TeamBench, read_key
-from pipeline.submission import System
+from pipeline.simulated.answer_key import TeamBench, changing_key, draw_bench, read_key
+from pipeline.submission import System, load_submission
+from pipeline.words.progress import Progress
+from pipeline.workflow import analyse
+
+if TYPE_CHECKING:
+    from pipeline.simulated.bench import SimulatedBench
 
 SOURCE = "answer_key"  # the source of a reference that is a true value
 
@@ -95,6 +102,40 @@ def recordings_of_others(analysis: Analysis) -> dict[str, Finding]:
     """Return the finding of each recording if the recordings are not of the team's bench."""
     ids = [record.id for record in analysis.records]
     return {id_: Finding(code="other_bench", run=id_, excludes="wrong") for id_ in ids}
+
+
+def write_team(
+    out: Path,
+    bench: "SimulatedBench",
+    *,
+    percent: float,
+    key: Path,
+    seed: int,
+    reported: bool,
+    progress: Progress,
+) -> None:
+    """Write the submission of a team, whose bench only the answer key knows.
+
+    Raises
+    ------
+    ConfigError : the key is in the team's folder or no key, or has another bench for the team.
+    """
+    from pipeline.simulated.submission import Students, write_submission
+
+    team = out.resolve().name
+    if key.resolve().is_relative_to(out.resolve()):
+        raise ConfigError(f"{key}: is in the team's folder; students would read it")
+    with changing_key(key) as answer_key:
+        rng = answer_key.generator(team, seed=seed)
+        own, answers = draw_bench(bench, percent=percent, rng=rng)
+        answer_key.enter(team, answers)
+        progress(f"simulating the experiments of {team}")
+        noise = int(rng.integers(2**63))
+        students = Students(title="Identification of carts on springs", is_anonymous=True)
+        write_submission(out, own, seed=noise, reported=reported, students=students)
+        analysis = analyse(load_submission(out), design=False, progress=progress)
+        found = {name: one.value for name, one in recompute(analysis).final.items()}
+        answer_key.teams[team] = replace(answers, found=found)
 
 
 def with_benches(hand_ins: Sequence[HandIn], key: Path) -> tuple[list[HandIn], tuple[str, ...]]:

@@ -76,6 +76,25 @@ def test_a_moved_slider_or_a_typed_number_counts():
 
 
 @pytest.mark.slow
+def test_each_team_gets_a_bench_of_its_own(visitor, tmp_path):
+    """With a percentage, the answer key beside the folder has another bench for each exercise."""
+    out = tmp_path / "teams"
+    fields = {"preset": "throne-1dof", "out": str(out), "folders": "2", "seed": "0", **FRICTION}
+    fields["coulomb_friction.place"] = "1"
+    refused = visitor.post("/exercises/make", **fields, vary="60")
+    assert refused.status == 422
+    assert 'id="vary-wrong"' in refused.text
+    visitor.post("/exercises/make", **fields, vary="20")
+    page = wait_for(visitor, f"/exercises/made?{urlencode({'out': out})}")
+    key = tmp_path / "teams-key.json"
+    assert str(key) in page
+    teams = json.loads(key.read_text(encoding="utf-8"))["teams"]
+    assert sorted(teams) == ["1", "2"]
+    assert teams["1"]["model"] != teams["2"]["model"]
+    assert "throne" not in "".join(p.read_text(encoding="utf-8") for p in out.rglob("*.toml"))
+
+
+@pytest.mark.slow
 @pytest.mark.sample
 def test_a_class_equals_what_simulate_writes(visitor, tmp_path):
     """A class of two folders has the same bytes as the class that `cartlab simulate` writes.

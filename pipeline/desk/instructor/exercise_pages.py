@@ -10,7 +10,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 
 from pipeline.desk.browse import free_path
-from pipeline.desk.exercises import SLIDE
+from pipeline.desk.exercises import SLIDE, key_of
 from pipeline.desk.form_input import keep_refusal, read_path, read_whole_number
 from pipeline.desk.jobs import Job
 from pipeline.desk.page_request import PageRequest
@@ -21,6 +21,7 @@ from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import Effect
 from pipeline.report.effect_texts import catalogue_data
+from pipeline.simulated.answer_key import MOST_PERCENT
 from pipeline.submission.load import NAME, file_problem
 from pipeline.words.math import to_text
 
@@ -45,6 +46,7 @@ class ExercisesPage:
     out: str
     folders: str
     seed: str
+    vary: str
     reported: bool
     wrong: Mapping[str, str]
     presets: Sequence[str] = tuple(sorted(PRESETS))
@@ -65,6 +67,7 @@ class MadePage:
     ----------
     made : folder and seed of each finished exercise.
     sentences : what is hidden, one sentence for each effect.
+    key : the answer key, if every exercise has a bench of its own.
     files, records : the data files of the first exercise, and its first record of each kind.
     """
 
@@ -72,6 +75,7 @@ class MadePage:
     job: Job
     made: Sequence[tuple[Path, int]]
     bench: Mapping[str, str]
+    key: Path | None = None
     sentences: Sequence[str] = ()
     files: Sequence[str] = ()
     records: Sequence[Mapping[str, Any]] = ()
@@ -118,6 +122,7 @@ def _show_form(
         out=str(sent.get("out", free_path(ask.user.workshop or ask.desk.root, "exercise"))),
         folders=str(sent.get("folders", "1")),
         seed=str(sent.get("seed", "0")),
+        vary=str(sent.get("vary", "0")),
         reported=bool(sent.get("reported")),
         wrong=wrong,
     )
@@ -142,6 +147,9 @@ def make(ask: PageRequest) -> Response:
         folders = read_whole_number(ask.text("folders"), name="folders", least=1, most=500)
     with keep_refusal("seed", wrong):
         seed = read_whole_number(ask.text("seed"), name="seed", least=0, most=2**31)
+    with keep_refusal("vary", wrong):
+        typed = ask.text("vary") or "0"
+        vary = read_whole_number(typed, name="percent", least=0, most=int(MOST_PERCENT))
     if wrong:
         return _show_form(ask, bench, found, wrong=wrong)
     ask.desk.jobs.start(
@@ -153,6 +161,7 @@ def make(ask: PageRequest) -> Response:
         out=str(out),
         seeds=list(range(seed, seed + folders)),
         reported=bool(ask.text("reported")),
+        vary=vary,
     )
     return RedirectResponse(f"/exercises/made?{urlencode({'out': out})}", status_code=303)
 
@@ -177,7 +186,8 @@ def show_made(ask: PageRequest) -> Response:
         what = ask.desk.workers.do(
             "describe_exercise", bench=bench, hide=hide, folder=str(made[0][0])
         )
-    page = MadePage(out=out, job=job, made=made, bench=arguments["bench"], **what)
+    key = key_of(out) if arguments["vary"] else None
+    page = MadePage(out=out, job=job, made=made, bench=arguments["bench"], key=key, **what)
     return ask.page("made", title=f"Exercise {out.name}", page=page)
 
 
