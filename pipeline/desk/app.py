@@ -155,6 +155,8 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/rubric/check", "POST", rubric_pages.check),
     ("/rubric/save", "POST", rubric_pages.save),
     ("/rubric/preview", "POST", rubric_pages.preview),
+    ("/rubric/simulated", "POST", rubric_pages.simulate),
+    ("/rubric/simulated", "GET", rubric_pages.show_simulated),
     ("/rubric/preview.svg", "GET", rubric_pages.draw_preview),
     ("/solution/{n:nth}/", "GET", exercise_pages.show_solution),
     ("/solution/{n:nth}/make", "POST", _start("make_solution", "The solution")),

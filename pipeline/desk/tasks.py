@@ -338,14 +338,24 @@ def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, A
         return asdict(preview(book, rubric, progress=progress))
 
 
+def simulate_students(folder: str, text: str, *, progress: Progress) -> str:
+    """Return what simulated students with a folder's recordings would get, as a table."""
+    from pipeline.grading.rubric_file import parse_rubric
+    from pipeline.grading.simulated_class import class_text, simulate_class
+
+    rubric = parse_rubric(text, where="the rubric")
+    submission = load_submission(Path(folder))
+    return class_text(simulate_class(submission, rubric=rubric, progress=progress))
+
+
 TASKS: Mapping[str, Callable[..., Any]] = {
     task.__name__: task
     for task in (
         *FOLDER_TASKS, describe_file, list_files, list_not_read, fill_tables, make_report, make_gap,
         check_numbers, propose_recordings, weigh_recording, publish_grades, check_grading,
         grade_submissions,
-        preview_rubric, check_exercise, draw_effect, make_exercises, make_solution,
-        describe_exercise, make_plots, render_notes, check_repair,
+        preview_rubric, simulate_students, check_exercise, draw_effect, make_exercises,
+        make_solution, describe_exercise, make_plots, render_notes, check_repair,
     )
 }  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Iterator
 from html import unescape
 from pathlib import Path
@@ -13,9 +14,10 @@ from pipeline.desk.instructor.rubric_list import own_rubrics
 from pipeline.desk.users import User
 from pipeline.grading.rubric import source_of
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.resources import RUBRICS
+from pipeline.resources import EXAMPLES, RUBRICS
 from tests.helpers.desks import Answer, Visitor, at_desk, wrongs
 from tests.helpers.grades import write_class_of_two
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.usefixtures("all_work_here")
 ONE_CART = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
@@ -240,6 +242,26 @@ def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
         saved = visitor.post("/rubric/save", **kept, text=unescape(typed[1]))
         assert load_rubric(lab).late.percent_per_day == 50
         assert 'action="/grades/0/grade"' in visitor.get(saved.headers["location"]).text
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_rubric_is_tried_on_simulated_students(visitor, lab, tmp_path):
+    """The typed rubric grades students with the recordings of a folder; nothing is saved."""
+    shutil.copytree(EXAMPLES / "one-cart", tmp_path / "reference")
+    page = editor(visitor, lab)
+    fields = sent(page, lab, **{"criteria.data.points": "2"})
+    refused = visitor.post("/rubric/simulated", **fields, reference=str(tmp_path))
+    assert refused.status == 422
+    assert 'id="reference-wrong"' in refused.text
+    started = visitor.post("/rubric/simulated", **fields, reference=str(tmp_path / "reference"))
+    address = started.headers["location"]
+    until(lambda: 'http-equiv="refresh"' not in visitor.get(address).text)
+    shown = visitor.get(address)
+    assert 'data-state="done"' in shown.text
+    assert re.search(r"20 honest students +21", shown.text)
+    assert lab.read_text(encoding="utf-8") == ONE_CART
+    assert visitor.get("/rubric/simulated?file=none.toml").status == 404
 
 
 def test_a_preview_of_an_anonymous_class_shows_no_name(tmp_path, lab):

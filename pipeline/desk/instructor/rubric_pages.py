@@ -13,7 +13,7 @@ from urllib.parse import urlencode
 from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 
-from pipeline.desk.form_input import read_path
+from pipeline.desk.form_input import keep_refusal, read_path
 from pipeline.desk.grades.grading_form import last_run
 from pipeline.desk.instructor.rubric_form import RubricDraft, make_draft, read_draft
 from pipeline.desk.instructor.rubric_list import (
@@ -24,6 +24,7 @@ from pipeline.desk.instructor.rubric_list import (
     shipped_rubrics,
     work_folder,
 )
+from pipeline.desk.jobs import Job
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
 from pipeline.desk.users import Place, name_place
@@ -37,6 +38,7 @@ from pipeline.report.figures.style import drawing, to_svg
 from pipeline.report.html import render_drawing
 from pipeline.resources import RUBRICS
 from pipeline.submission.edit import Stale, require_version, text_digest
+from pipeline.submission.load import NAME
 
 _NEW = "new"  # version in a form whose file does not exist yet
 
@@ -60,6 +62,8 @@ class RubricPage:
     ----------
     file : path of the file, as it was typed if it was refused.
     refused : why this path was refused, or "".
+    no_students : why no students can be simulated, or "".
+    reference : the folder whose recordings simulated students have.
     seen : version of the file on which the typed text is based.
     now : current text of the file, if somebody has changed it since.
     classes : number and name of each open class.
@@ -69,6 +73,8 @@ class RubricPage:
 
     file: Path | str
     refused: str
+    no_students: str
+    reference: str
     typed: RubricDraft
     seen: str
     now: str | None
@@ -139,6 +145,7 @@ def _show_editor(
     version: str,
     now: str | None = None,
     refused: str = "",
+    no_students: str = "",
     status: int = 200,
 ) -> Response:
     """Show the editor.
@@ -148,11 +155,14 @@ def _show_editor(
     version : version of the file on which the typed text is based.
     now : current text of the file, if somebody has changed it since.
     refused : why the path was refused, or "".
+    no_students : why no students can be simulated, or "".
     """
     saved = "saved" in ask.request.query_params
     page = RubricPage(
         file=path,
         refused=ask.user.name_places(refused),
+        no_students=ask.user.name_places(no_students),
+        reference=ask.text("reference") or next(map(str, ask.user.folders), ""),
         typed=typed,
         seen=version,
         now=now,
@@ -295,6 +305,62 @@ def preview(ask: PageRequest) -> Response:
         titles=typed.rubric.titles,
     )
     return ask.page("rubric_preview", title=f"{path.name}: preview", page=page)
+
+
+# ----------------------------------------------------------------------- simulated students
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedStudentsPage:
+    """What simulated students would get under a rubric that is not saved yet.
+
+    Attributes
+    ----------
+    text, seen : the typed rubric, and the version of the file on which it is based.
+    job : the task; when it is done, its message is the table.
+    """
+
+    file: Path
+    text: str
+    seen: str
+    job: Job
+
+
+def simulate(ask: PageRequest) -> Response:
+    """Start the task that grades simulated students with the typed rubric; nothing is saved."""
+    path, typed, seen = _read_typed_path(ask), read_draft(ask.form), ask.text("seen")
+    if isinstance(path, Response):
+        return path
+    wrong: dict[str, str] = {}
+    with keep_refusal("reference", wrong):
+        folder = _read_reference(ask)
+        if typed.rubric is not None:
+            task = {"folder": str(folder), "text": typed.text}
+            ask.desk.jobs.start("simulate_students", title="Simulated students", place=path, **task)
+    if wrong or typed.rubric is None:
+        refused = wrong.get("reference", "")
+        return _show_editor(ask, path, typed, version=seen, no_students=refused, status=422)
+    query = urlencode({"file": path, "seen": seen})
+    return RedirectResponse(f"/rubric/simulated?{query}", status_code=303)
+
+
+def _read_reference(ask: PageRequest) -> Path:
+    wanted = "enter the folder of a submission whose recordings the students have"
+    folder = read_path(ask.text("reference"), wanted=wanted, inside=ask.user.workshop)
+    if not (folder / NAME).is_file():
+        raise ConfigError(f"{folder}: has no {NAME}; {wanted}")
+    return folder
+
+
+def show_simulated(ask: PageRequest) -> Response:
+    """Show the progress of grading simulated students, or their points."""
+    path = _read_rubric_path(ask)
+    job = ask.desk.jobs.of(path)
+    if job is None or job.task[0] != "simulate_students":
+        raise HTTPException(404, "no students were simulated for this rubric")
+    text = job.task[1]["text"]
+    page = SimulatedStudentsPage(file=path, text=text, seen=ask.text("seen"), job=job)
+    return ask.page("rubric_simulated", title=f"{path.name}: simulated students", page=page)
 
 
 def draw_preview(ask: PageRequest) -> Response:
