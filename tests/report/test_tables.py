@@ -5,8 +5,9 @@ from decimal import Decimal
 
 from pipeline.estimation.estimates import list_off
 from pipeline.report.builder import Page
+from pipeline.report.document import Table
 from pipeline.report.sections.measurements import dwell_table
-from pipeline.report.sections.parameters import parameter_table, reported_table
+from pipeline.report.sections.parameters import parameter_blocks, parameter_table, reported_table
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.words.text import plain
 from tests.helpers.analysis_factory import make_analysis
@@ -80,3 +81,13 @@ def test_a_dwell_that_did_not_settle_is_marked():
     table = dwell_table(Page(replace(analysis, sine_points=points)))
     assert len(table.rows) == len(points)
     assert [cell.tone for row in table.rows for cell in row if cell.tone] == ["bad"]
+
+
+def test_without_any_estimate_there_is_no_table():
+    """If nothing was estimated and nothing reported, a sentence replaces the empty table."""
+    full = make_analysis(1)
+    empty = [replace(row, initial=None, final=None) for row in full.rows]
+    nothing = replace(full, rows=tuple(empty), reported={"initial": {}, "final": {}}, fit=None)
+    for analysis, has_table in ((nothing, False), (full, True)):
+        blocks = parameter_blocks(Page(analysis))
+        assert any(isinstance(block, Table) for block in blocks) == has_table

@@ -29,6 +29,8 @@ def parameter_blocks(page: Page) -> list[Block]:
     rows, reported = page.analysis.rows, page.analysis.reported
     if not rows:
         return []
+    if not any(reported.values()) and not any(row.initial or row.final for row in rows):
+        return [paragraph(_WORDS.spans("no_estimate"))]
     table = parameter_table(page)
     blocks: list[Block] = [paragraph(_origins(page.analysis)), table]
     blocks += _fit_quality(page.analysis)
