@@ -312,7 +312,7 @@ def preview(ask: PageRequest) -> Response:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedStudentsPage:
-    """What simulated students would get under a rubric that is not saved yet.
+    """The points of simulated students under a rubric that is not saved yet.
 
     Attributes
     ----------
