@@ -184,7 +184,7 @@ def _text(health: Health) -> str:
         lines += ["  " + ", ".join(f"{one.name} {one.found}" for one in health.needed)]
     lines += ["optional:"]
     for extra, packages in health.extras.items():
-        lacking = [f"{one.name} {one.problem}" for one in packages if one.problem]
+        lacking = [f"{one.name}: {one.problem}" for one in packages if one.problem]
         state = f"no ({'; '.join(lacking)}): pip install 'cartlab[{extra}]'" if lacking else "yes"
         lines += [f"  {extra}, {_EXTRAS[extra]}: {state}"]
     lines += [f"  {what}: {path or 'not found'}" for what, path in health.programs.items()]

@@ -83,7 +83,7 @@ def new_rubric(submission: Submission, analysis: Analysis, *, source: str) -> Ne
     if not draft.names["initial"] and not draft.names["final"]:
         raise ConfigError(
             f"{source}: its recordings decide no number that students could report; "
-            "`cartlab report` says what is missing"
+            f"`cartlab report {source}` says what is missing"
         )
     criteria = list(draft.criteria())
     points = share_points([one.points for one, _ in criteria], out_of=OUT_OF, step=STEP)

@@ -241,6 +241,7 @@ def _make_files(
         analysis = replace(analysis, warnings=(*analysis.warnings, warning))
         progress(warning)
     document = build_document(analysis, gap=gap, changes=changes, progress=progress)
+    progress("report: writing its files")
     if not files.plots:
         return make_files(document, name=NAME, pdf=files.pdf)
     # Imported late, because it loads the catalogue of effects.

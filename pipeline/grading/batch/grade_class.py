@@ -64,7 +64,7 @@ class Summary:
     def counted(self) -> str:
         """The counts in words, such as `12 of 13 graded`."""
         shared = (
-            f", {self.sharing} with recordings or numbers that another submission also contains"
+            f"; recordings or numbers of {self.sharing} are also in another submission"
             if self.sharing
             else ""
         )
