@@ -181,7 +181,7 @@ def test_the_page_is_small_valid_and_the_same_every_time(tmp_path):
     ids = Counter(re.findall(r'\sid="([^"]*)"', page))
     assert [id_ for id_, n in ids.items() if n > 1] == []
     assert len(data_of(page)["runs"]) == 36
-    assert "36 runs" in page
+    assert "36 recordings" in page
 
 
 def test_markup_in_a_submission_is_shown_as_text():
