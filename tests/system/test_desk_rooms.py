@@ -72,7 +72,7 @@ def test_a_session_is_watched_and_steered(show, tmp_path, real, monkeypatch):
         expect(window.get_by_text("Stopped. Start again")).to_be_visible()
         row = window.get_by_role("row").filter(has_text="last")
         expect(row).to_contain_text("next")
-        expect(row).to_contain_text("An earlier run ended early")
+        expect(row).to_contain_text("An earlier try ended early")
         window.get_by_text("2 recorded").click()
         expect(window.get_by_role("row").filter(has_text="long")).to_contain_text("recorded")
         assert fits(window)
