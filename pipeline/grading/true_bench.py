@@ -24,7 +24,6 @@ from pipeline.results import Analysis, Finding
 from pipeline.simulated.answer_key import TeamBench, changing_key, draw_bench, read_key
 from pipeline.submission import System, load_submission
 from pipeline.words.progress import Progress
-from pipeline.workflow import analyse
 
 if TYPE_CHECKING:
     from pipeline.simulated.bench import SimulatedBench
@@ -121,6 +120,7 @@ def write_team(
     ConfigError : the key is in the team's folder or no key, or has another bench for the team.
     """
     from pipeline.simulated.submission import Students, write_submission
+    from pipeline.workflow import analyse
 
     team = out.resolve().name
     if key.resolve().is_relative_to(out.resolve()):

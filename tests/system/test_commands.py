@@ -126,7 +126,7 @@ def test_an_unreadable_file_affects_only_its_run(tmp_path):
     skipped = {skip["stage"]: skip["reason"] for skip in found["skipped"]}
     page = html.unescape((folder / "report" / "report.html").read_text(encoding="utf-8"))
     for name, reason in reasons.items():
-        assert re.search(f"cartlab: {name}: .*{reason}", done.stderr)
+        assert re.search(f"- {name}: .*{reason}", " ".join(done.stderr.split()))
         assert reason in skipped[f"reading {name}"]
         assert reason in page
     assert all(parameter["initial"] and parameter["final"] for parameter in found["parameters"])

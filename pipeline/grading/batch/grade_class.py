@@ -24,7 +24,6 @@ from pipeline.grading.publish.pseudonyms import STRANGER, pseudonyms_in
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import find_rubric, load_rubric
 from pipeline.grading.similarity.fingerprints import fingerprint
-from pipeline.grading.true_bench import with_benches
 from pipeline.lock import lock_or_refuse
 from pipeline.output import OWNERS_FOLDER, named_folder, own_folder
 from pipeline.resources import EXAMPLES, RUBRICS
@@ -165,6 +164,8 @@ def grade_class(
         hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
         lacking: Sequence[str] = ()
         if options.key:
+            from pipeline.grading.true_bench import with_benches
+
             hand_ins, lacking = with_benches(hand_ins, Path(options.key))
         with book_of(create=True) as book:
             shown = _pseudonyms(book) if hidden else str
