@@ -1030,6 +1030,7 @@ class RecordingGroup:
     std: dict[str, float] = written("standard errors")
     label: str = written("the day or folder that only these recordings share", default="")
     remark: str = written("why they may differ, and what to state then", default="")
+    is_rest: bool = written("whether they follow the carts of no group", default=False)
 
 
 @result()

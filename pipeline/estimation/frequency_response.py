@@ -201,7 +201,7 @@ def dwell_fault(point: SinePoint) -> str:
     if not all(np.isfinite(x) and x > 0 for x in (point.omega, point.gain, point.gain_std)):
         return (
             "a frequency response needs a frequency and an amplitude ratio with its error, found "
-            f"{point.omega:.3g} rad/s and {point.gain:.3g}"
+            f"{point.omega:.3g} rad/s and {point.gain:.3g} ± {point.gain_std:.3g}"
         )
     return ""
 

@@ -19,7 +19,7 @@ from pipeline.ingest.columns import conversion
 from pipeline.json_files import json_text
 from pipeline.names import read_name
 from pipeline.plant.chain import Chain
-from pipeline.plant.effect import EffectTerm
+from pipeline.plant.effect import EffectTerm, evaluate
 from pipeline.results import Analysis, Finding
 from pipeline.simulated.answer_key import TeamBench, changing_key, draw_bench, read_key
 from pipeline.submission import System, load_submission
@@ -38,7 +38,7 @@ class TrueBench:
     Attributes
     ----------
     found : the values that an analysis of the recordings of this bench gives.
-    effects : the hidden effects; None if their units are not those of the submission.
+    effects : the hidden effects; None if their units do not convert to those of the submission.
     """
 
     chain: Chain
@@ -51,8 +51,9 @@ class TrueBench:
     def read(cls, text: str, system: System) -> "TrueBench":
         """Return the bench that `with_benches` turned into text."""
         bench = TypeAdapter(TeamBench).validate_json(text)
-        length = conversion(bench.units.position, system.position.unit) or 1.0
-        gain = length / (conversion(bench.units.input, system.input.unit) or 1.0)
+        length = conversion(bench.units.position, system.position.unit)
+        drive = conversion(bench.units.input, system.input.unit)
+        gain = (length or 1.0) / (drive or 1.0)
         chain = bench.model.chain
 
         def scaled(values: Mapping[str, float]) -> dict[str, float]:
@@ -62,7 +63,9 @@ class TrueBench:
             chain=Chain(m=chain.m / gain, c=chain.c / gain, k=chain.k / gain),
             parameters=scaled(bench.parameters),
             found=scaled(bench.found),
-            effects=bench.model.terms if gain == length == 1 else None,
+            effects=[_converted(term, length, drive) for term in bench.model.terms]
+            if length and drive
+            else None,
             is_linear=not bench.model.terms,
         )
 
@@ -95,6 +98,17 @@ class TrueBench:
             return {name: true(name, one) for name, one in of.items()}
 
         return References(initial=table(references.initial), final=table(references.final))
+
+
+def _converted(term: EffectTerm, length: float, drive: float) -> EffectTerm:
+    """Return an effect in other units of length and input, given the size of the old ones."""
+    sizes = {"position": length, "input": drive, "s": 1.0, "rad": 1.0}
+
+    def factor(unit: str) -> float:  # of input s^2/position, say
+        return evaluate(unit.replace(" ", "*").replace("^", "**") or "1", sizes)
+
+    parts = zip(term.values, term.effect.parameters, strict=True)
+    return replace(term, values=tuple(value * factor(one.unit) for value, one in parts))
 
 
 def recordings_of_others(analysis: Analysis) -> dict[str, Finding]:

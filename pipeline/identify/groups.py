@@ -312,7 +312,9 @@ def find_setups(driven: Sequence[Record], *, bench: Setup) -> tuple[RecordingGro
     ]
     if others:
         remark = say("group_others")
-        groups.append(RecordingGroup(experiments=others, values={}, std={}, remark=remark))
+        groups.append(
+            RecordingGroup(experiments=others, values={}, std={}, remark=remark, is_rest=True)
+        )
     return tuple(groups)
 
 
@@ -534,8 +536,7 @@ def leave_out_lines(groups: Sequence[RecordingGroup]) -> dict[int, str]:
     The largest group comes first. Recordings that belong to no group get no line.
     """
     known = [name for group in groups for name in group.experiments]
-    others = say("group_others")
-    numbered = [(i, group) for i, group in enumerate(groups, start=1) if group.remark != others]
+    numbered = [(i, group) for i, group in enumerate(groups, start=1) if not group.is_rest]
     numbered.sort(key=lambda one: len(one[1].experiments), reverse=True)
     lines = {}
     for number, kept in numbered:

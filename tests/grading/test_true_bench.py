@@ -90,6 +90,19 @@ def test_true_values_are_in_the_units_of_the_submission():
     assert other.chain.parameters() == pytest.approx(dict(other.parameters))
 
 
+def test_hidden_effects_are_in_the_units_of_the_submission():
+    """Sizes follow the units of length and input, whatever their powers."""
+    _, answers = draw(1, "coulomb_friction", "cubic_spring", "input_delay")
+    position = RUBRIC.system.position.model_copy(update={"unit": "mm"})
+    system = RUBRIC.system.model_copy(update={"position": position})
+    system = system.model_copy(update={"input": system.input.model_copy(update={"unit": "mV"})})
+    usual, other = (TrueBench.read(json_text(answers), one) for one in (RUBRIC.system, system))
+    assert usual.effects
+    assert other.effects
+    ratios = [b.values[0] / a.values[0] for a, b in zip(usual.effects, other.effects, strict=True)]
+    assert ratios == pytest.approx([1e3, 1e3 / 10**3, 1.0])  # V, V/cm³ and s
+
+
 def test_bounds_are_those_of_the_own_bench():
     """Own recordings widen the bounds around the true value; those of others do not."""
     _, answers = draw(1)

@@ -138,11 +138,11 @@ def test_a_day_that_is_part_of_another_is_no_pattern():
 def test_each_group_can_be_kept_the_largest_first():
     """There is a line for each group, remark or not, but none for recordings of no group."""
     groups = [
-        RecordingGroup(experiments=names, values={}, std={}, remark=remark)
-        for names, remark in (
-            (("a", "b"), ""),
-            (("c", "d", "e"), say("group_at_input")),
-            (("f", "g", "h", "i"), say("group_others")),
+        RecordingGroup(experiments=names, values={}, std={}, remark=remark, is_rest=is_rest)
+        for names, remark, is_rest in (
+            (("a", "b"), "", False),
+            (("c", "d", "e"), "state something", False),
+            (("f", "g", "h", "i"), "", True),
         )
     ]
     lines = leave_out_lines(groups)

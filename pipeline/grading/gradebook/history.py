@@ -46,11 +46,7 @@ def read_history(
     done = read_events(connection, events.c.submission_id == submission).get(submission, ())
     found = [
         *_graded(connection, submission),
-        *(
-            _shown(event, named=named)
-            for event in done
-            if event.what in (*POINTS, *REQUESTS, *HOLDS)
-        ),
+        *(_shown(event, named=named) for event in done if event.what in _TOLD),
         *_listed(connection, submission, named=named),
         *_passed(connection, submission, [event for event in done if event.what in POINTS]),
     ]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from fractions import Fraction
 from typing import Any
 
@@ -308,47 +309,52 @@ def _state_space(criterion: asked.StateModel, context: GradingContext) -> Verdic
 def _effects(criterion: asked.Effects, context: GradingContext) -> Verdict:
     """Judge the named effects against those of the team's bench."""
     if context.effects is None:
-        return Verdict(share=None, message="Not checked: no answer key has this bench.")
+        return Verdict(
+            share=None, message="Not checked: no answer key has this bench in these units."
+        )
     named = context.reported.effects
     if named is None:
         why = context.because_unread("effects")
         return Verdict(share=NONE, message=f"No effect is reported.{why}")
     hidden = {term.effect.key: term for term in context.effects}
     deviations: list[Deviation] = []
-    off: list[str] = []
+    off: dict[str, list[str]] = {}  # what is wrong, by effect
     for key, term in hidden.items():
-        stated = named.get(key, {})
+        stated, wrong = named.get(key, {}), off.setdefault(key, [])
         if key not in named:
-            off.append(f"an effect is missing{context.because_unread('effects', key)}")
-        deviations.append(Deviation(error=Fraction(0) if key in named else NO_CREDIT))
+            wrong.append(f"an effect is missing{context.because_unread('effects', key)}")
+        errors = {"": Fraction(0) if key in named else NO_CREDIT}
         for place, number in term.where.items():
-            is_right = stated.get(place) == number
-            deviations.append(Deviation(error=Fraction(0) if is_right else NO_CREDIT))
-            if key in named and not is_right:
-                off.append(f"{key}: another {place}")
-        for parameter, value in zip(term.effect.parameters, term.values, strict=True):
-            if not parameter.reported:
-                continue
-            error = NO_CREDIT
-            if (typed := stated.get(parameter.name)) is not None:
-                sign = 1 if value > 0 else -1
-                error = percent_off(sign * typed, Reference.at(abs(value)), sigmas=0.0)
+            errors[place] = Fraction(0) if stated.get(place) == number else NO_CREDIT
+        for parameter in term.effect.parameters:
+            if parameter.reported:
+                value, typed = term.parameters[parameter.name], stated.get(parameter.name)
+                errors[parameter.name] = _signed_error(typed, value)
+        for name, error in errors.items():
             deviations.append(Deviation(error=error))
             if key in named and points_for_one(criterion, deviations[-1]) < 1:
-                said = "not reported" if typed is None else as_typed(typed)
-                off.append(f"{key}: {parameter.name} is {said}")
+                said = f"is {as_typed(stated[name])}" if name in stated else "is not reported"
+                wrong.append(f"{key}: {name} {said}")
     for key in named.keys() - hidden.keys():
         deviations.append(Deviation(error=NO_CREDIT))
-        off.append(f"{key}: your bench does not have it")
-    share = points_for(criterion, deviations) if deviations else ALL
+        off[key] = [f"{key}: your bench does not have it"]
+    said = [text for texts in off.values() for text in texts]
     return Verdict(
-        share=share,
+        share=points_for(criterion, deviations) if deviations else ALL,
         models=(tuple(deviations),) if deviations else (),
-        message=f"{'; '.join(off[:_NAMED])}." if off else "The effects of your bench are named.",
+        message=f"{'; '.join(said[:_NAMED])}." if said else "The effects of your bench are named.",
         expected={key: {**term.where, **term.parameters} for key, term in hidden.items()},
         found={key: {n: float(v) for n, v in one.items()} for key, one in named.items()},
-        agrees={key: not any(text.startswith(key) for text in off) for key in named},
+        agrees={key: not off[key] for key in named},
     )
+
+
+def _signed_error(typed: Decimal | None, value: float) -> Fraction:
+    """Return the error of a number that may be negative, in percent; a missing one is all wrong."""
+    if typed is None:
+        return NO_CREDIT
+    size = typed if value > 0 else -typed
+    return percent_off(size, Reference.at(abs(value)), sigmas=0.0)
 
 
 def _manual(_criterion: asked.Manual, _work: GradingContext) -> Verdict:
