@@ -333,8 +333,9 @@ def _effects(criterion: asked.Effects, context: GradingContext) -> Verdict:
         for name, error in errors.items():
             deviations.append(Deviation(error=error))
             if key in named and points_for_one(criterion, deviations[-1]) < 1:
-                said = f"is {as_typed(stated[name])}" if name in stated else "is not reported"
-                wrong.append(f"{key}: {name} {said}")
+                right = f"your bench has {(term.where | term.parameters)[name]:.3g}"
+                typed = f"{name} = {as_typed(stated[name])}" if name in stated else f"no {name}"
+                wrong.append(f"{key}: you report {typed}, but {right}")
     for key in named.keys() - hidden.keys():
         deviations.append(Deviation(error=NO_CREDIT))
         off[key] = [f"{key}: your bench does not have it"]
