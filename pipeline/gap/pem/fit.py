@@ -290,12 +290,12 @@ def shaped_laws(fit: PemFit, records: Records) -> list[TrialLaw]:
     stretch = np.zeros((2, n + 1))
     speed = np.zeros(n)
     for run, own in zip(records.runs, fit.own, strict=True):
-        track = run.followed
-        x = np.where(track.free, track.y - own.zero, 0.0)
+        followed = run.followed
+        x = np.where(followed.free, followed.y - own.zero, 0.0)
         position = np.maximum(position, [x.max(0), -x.min(0)])
         d = np.diff(np.pad(x, ((0, 0), (1, 1))), axis=1)
         stretch = np.maximum(stretch, [d.max(0), -d.min(0)])
-        v = np.gradient(x, track.t, axis=0)
+        v = np.gradient(x, followed.t, axis=0)
         speed = np.maximum(speed, np.quantile(np.abs(v), 0.98, axis=0))
     shapes: dict[tuple[int, int], list[tuple[float, ...]]] = {}
     for i in range(n):

@@ -429,11 +429,11 @@ def errors_of(
     """
     n, count = laws.bench.n, len(laws.keys)
     lanes = p.size + 4 * n if derive else 0
-    track = run.followed
-    E, J = np.zeros((track.t.size, n)), np.zeros((lanes, track.t.size, n))
-    x = np.where(track.free, run.start - own.zero + own.shift, 0.0)
+    followed = run.followed
+    E, J = np.zeros((followed.t.size, n)), np.zeros((lanes, followed.t.size, n))
+    x = np.where(followed.free, run.start - own.zero + own.shift, 0.0)
     DX, DV = np.zeros((n, lanes)), np.zeros((n, lanes))
-    for i in np.flatnonzero(track.free) if derive else ():
+    for i in np.flatnonzero(followed.free) if derive else ():
         DX[i, p.size + i], DX[i, p.size + n + i], DV[i, p.size + 2 * n + i] = -1.0, 1.0, 1.0
     aux, DA = np.zeros((count, kernel.ROOM)), np.zeros((2 * count, lanes))
     for law, (kind, place) in enumerate(laws.keys):
@@ -442,10 +442,10 @@ def errors_of(
             DA[2 * law], DA[2 * law + 1] = DX[place], DV[place]
     play = max(np.flatnonzero(laws.kinds == EffectKind.BACKLASH), default=-1)
     # With a large gain, step errors do not add up.
-    longest = track.longest * (1.0 if gain > 0.05 else _FREELY)
+    longest = followed.longest * (1.0 if gain > 0.05 else _FREELY)
     if play >= 0:
-        longest = min(longest, _KNOCK * track.longest)
-    track = track._replace(
+        longest = min(longest, _KNOCK * followed.longest)
+    followed = followed._replace(
         held=_shaped(run, p[laws.drive_at + DEAD_ZONE], p[laws.drive_at + LIMIT]),
         zero=own.zero,
         factor=own.factor,
@@ -455,7 +455,7 @@ def errors_of(
     state = kernel.PemState(x, own.v0.copy(), aux, DX, DV, DA)
     room = (np.zeros(shape) for shape in (n, n, n, (n, n), (n, n), 4, 4, (n, lanes), (n, lanes)))
     acting = kernel.ActingLaws(p, laws.kinds, laws.places, laws.first, int(play))
-    fine = kernel.predict_run(acting, track, state, kernel.WorkArrays(*room), E, J)
+    fine = kernel.predict_run(acting, followed, state, kernel.WorkArrays(*room), E, J)
     return (E, J) if fine and np.all(np.isfinite(E)) else None
 
 
