@@ -1,0 +1,133 @@
+"""Which realistic faults do the tests notice, and which tests?
+
+    python -m benchmarks.faults [--suite] [FILE …] [NUMBER …]
+
+One fault of `faults.toml` at a time is put into a copy of this checkout. The tests of its own room
+run until one fails, for at most a minute: first those that import the faulty module, then those
+whose path is most like it. With `--suite`, the default suite and its sample follow if no test
+failed. The list stays true, because a fragment that is not found exactly once is refused. Seconds
+are those of a processor.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+CHECKOUT = Path(__file__).parents[1]
+LIST = Path(__file__).with_suffix(".toml")
+_LEFT = shutil.ignore_patterns(".git", ".*_cache", ".venv", "site", "build", "dist")
+_ROOM_SECONDS, _SUITE_SECONDS = 60.0, 3600.0  # after these a fault counts as unnoticed
+_WIDER = {"suite": "not slow", "sample": "slow and sample"}
+
+
+class Fault(NamedTuple):
+    """A wrong line: file below pipeline/, fragment, its replacement, and the room of its tests."""
+
+    file: str
+    old: str
+    new: str
+    tests: str
+    breaks: str
+
+
+class Outcome(NamedTuple):
+    """The test that failed, "" for none, and the processor seconds until then."""
+
+    test: str
+    seconds: float
+
+
+def read_faults() -> list[Fault]:
+    """Read the list of faults; refuse one whose fragment its file does not hold exactly once."""
+    faults = [Fault(**entry) for entry in tomllib.loads(LIST.read_text("utf-8"))["faults"]]
+    for number, fault in enumerate(faults, 1):
+        times = (CHECKOUT / "pipeline" / fault.file).read_text("utf-8").count(fault.old)
+        if times != 1 or fault.old == fault.new:
+            raise ValueError(f"fault {number}: {fault.file} holds {fault.old!r} {times} times")
+    return faults
+
+
+def order_files(fault: Fault, checkout: Path) -> list[str]:
+    """List the test files of the fault's room, those that are nearest to its module first."""
+    module = "pipeline." + fault.file.removesuffix(".py").replace("/", ".")
+    package, _, name = module.rpartition(".")
+    imports = re.compile(rf"(import|from) {module}\b|from {package} import [^#]*?\b{name}\b")
+    parts = set(re.split(r"[/_.]", fault.file)) - {"py"}
+
+    def distance(file: Path) -> tuple[bool, int, int]:
+        words = set(re.split(r"[/_.]", file.relative_to(checkout / "tests").as_posix()))
+        return not imports.search(file.read_text("utf-8")), -len(parts & words), file.stat().st_size
+
+    files = sorted((checkout / "tests" / fault.tests).rglob("test_*.py"), key=distance)
+    return [file.relative_to(checkout).as_posix() for file in files]
+
+
+def run_tests(tests: Sequence[str], checkout: Path, *, marked: str, most: float) -> Outcome:
+    """Run tests one after the other until one fails, for at most `most` seconds."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider"]
+    command += ["-p", "benchmarks.faults", "-m", marked, *tests]
+    began, environment = sum(os.times()[2:4]), os.environ | {"PYTHONPATH": str(checkout)}
+    with subprocess.Popen(command, cwd=checkout, env=environment, stdout=subprocess.PIPE) as run:
+        try:
+            said = run.communicate(timeout=most)[0].decode(errors="replace")
+        except subprocess.TimeoutExpired:
+            run.terminate()
+            said = ""
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", said, re.MULTILINE)
+    if run.returncode > 0 and not failed:
+        raise RuntimeError(f"pytest could not run:\n{said}")
+    return Outcome(test=failed[1] if failed else "", seconds=sum(os.times()[2:4]) - began)
+
+
+def pytest_collection_modifyitems(config, items: list) -> None:
+    """Keep the order of the files as given: this module is a plugin of pytest in its runs."""
+    place = {Path(name).resolve(): i for i, name in enumerate(config.args)}
+    items.sort(key=lambda item: place.get(item.path.resolve(), 0))
+
+
+def judge_fault(fault: Fault, checkout: Path, *, wider: bool) -> dict[str, Outcome]:
+    """Return by which runs of tests the fault is noticed: room, and if not there suite, sample."""
+    path = checkout / "pipeline" / fault.file
+    right = path.read_text("utf-8")
+    path.write_text(right.replace(fault.old, fault.new), "utf-8")
+    try:
+        own = order_files(fault, checkout)
+        runs = {"room": run_tests(own, checkout, marked="not slow", most=_ROOM_SECONDS)}
+        for name, marked in _WIDER.items() if wider else ():
+            if not any(one.test for one in runs.values()):
+                runs[name] = run_tests(["tests"], checkout, marked=marked, most=_SUITE_SECONDS)
+        return runs
+    finally:
+        path.write_text(right, "utf-8")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print a row for each fault as soon as it is known, and the counts."""
+    chosen = [one for one in arguments if not one.startswith("--")]
+    wider, found = "--suite" in arguments, list[dict[str, Outcome]]()
+    print("| fault | what breaks | noticed by | s |\n| --- | --- | --- | --- |")
+    with tempfile.TemporaryDirectory() as folder:
+        checkout = Path(folder) / "checkout"
+        shutil.copytree(CHECKOUT, checkout, ignore=_LEFT, symlinks=True)
+        for number, fault in enumerate(read_faults(), 1):
+            if chosen and not any(str(number) == c or fault.file.startswith(c) for c in chosen):
+                continue
+            found.append(runs := judge_fault(fault, checkout, wider=wider))
+            last, (test, seconds) = list(runs.items())[-1]
+            by = f"{last}: {test.removeprefix('tests/')}" if test else "nothing"
+            row = f"{number} {fault.file} | {fault.breaks} | {by} | {seconds:.0f}"
+            print(f"| {row} |", flush=True)
+    room = [one["room"].seconds for one in found if one["room"].test]
+    quick, every = sum(s < 20 for s in room), sum(any(o.test for o in r.values()) for r in found)
+    print(f"\n{len(room)} of {len(found)} noticed by the room, {quick} in 20 s, {every} in all")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
