@@ -76,7 +76,8 @@ Hide = Annotated[
     list[str] | None,
     typer.Option(
         metavar="EFFECT[:key=value,…]",
-        help="Hide an effect (see `cartlab effects`); may be repeated.",
+        help="Hide an effect (see `cartlab effects`); may be repeated. `simulate --vary` "
+        "draws one of EFFECT/EFFECT/…",
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]

@@ -428,17 +428,18 @@ def simulate(
     from pipeline.simulated.submission import write_submission
 
     new_folder(out)
-    bench = prepare_bench(preset=preset, model=model, hide=hide or ())
+    prepare = partial(prepare_bench, preset=preset, model=model, hide=hide or ())
     if vary is not None and secret is not None:
         from pipeline.grading.true_bench import write_team
 
         with progress_line() as progress:
             write_team(
-                out, bench, percent=vary, key=secret, seed=seed, reported=reported,
-                progress=progress,
+                out, lambda rng: prepare(rng=rng), percent=vary, key=secret, seed=seed,
+                reported=reported, progress=progress,
             )  # fmt: skip
         say(f"wrote {out}, and its true values to {secret}")
         return
+    bench = prepare()
     for sentence in bench.effect_sentences:
         say(f"hidden: {sentence}")
     with progress_line() as progress:

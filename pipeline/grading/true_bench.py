@@ -3,7 +3,7 @@
 A number that somebody copies from another team is then wrong, whatever the recordings show.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -119,7 +119,7 @@ def recordings_of_others(analysis: Analysis) -> dict[str, Finding]:
 
 def write_team(
     out: Path,
-    bench: "SimulatedBench",
+    prepare: "Callable[[np.random.Generator], SimulatedBench]",
     *,
     percent: float,
     key: Path,
@@ -128,6 +128,10 @@ def write_team(
     progress: Progress,
 ) -> None:
     """Write the submission of a team, whose bench only the answer key knows.
+
+    Parameters
+    ----------
+    prepare : function that returns the bench to vary; it may draw what is hidden in it.
 
     Raises
     ------
@@ -141,7 +145,7 @@ def write_team(
         raise ConfigError(f"{key}: is in the team's folder; students would read it")
     with changing_key(key) as answer_key:
         rng = answer_key.generator(team, seed=seed)
-        own, answers = draw_bench(bench, percent=percent, rng=rng)
+        own, answers = draw_bench(prepare(rng), percent=percent, rng=rng)
         answer_key.enter(team, answers)
         progress(f"simulating the experiments of {team}")
         noise = int(rng.integers(2**63))

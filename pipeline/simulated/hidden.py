@@ -25,7 +25,11 @@ _INPUT_RESERVE = 4.0  # multiple of the input that holds a cart at its travel
 
 
 def prepare_bench(
-    *, preset: str | None = None, model: Path | None = None, hide: Sequence[str] = ()
+    *,
+    preset: str | None = None,
+    model: Path | None = None,
+    hide: Sequence[str] = (),
+    rng: np.random.Generator | None = None,
 ) -> SimulatedBench:
     """Return a preset, or the model of a `gap.json`, with further effects hidden in it.
 
@@ -33,6 +37,8 @@ def prepare_bench(
     ----------
     hide : effects to hide, each as `EFFECT` or `EFFECT:key=value,…`. The keys are `cart` or
         `spring` and the parameters of the law. Omitted parameters get a clearly visible size.
+    rng : random numbers that draw one of the alternatives of a text `EFFECT/EFFECT/…`; None if
+        there may be no alternatives.
 
     Raises
     ------
@@ -42,9 +48,30 @@ def prepare_bench(
         raise ConfigError("name a bench: either --preset or --model")
     bench = _read_model(model) if model is not None else preset_bench(preset or "")
     for text in hide:
-        term, given = _named_effect(text, bench)
-        bench = _with_effect(bench, term, where=f"--hide {text}", given=given)
+        option = _choose(text, bench, rng)
+        term, given = _named_effect(option, bench)
+        bench = _with_effect(bench, term, where=f"--hide {option}", given=given)
     return bench
+
+
+def _choose(text: str, bench: SimulatedBench, rng: np.random.Generator | None) -> str:
+    """Return an alternative of `EFFECT/EFFECT/…` that is unlike all effects of the bench."""
+    options = text.split("/")
+    if len(options) == 1:
+        return text
+    if rng is None:
+        raise ConfigError(
+            f"--hide {text}: only `simulate --vary … --secret …` draws one of several effects"
+        )
+    terms = [_named_effect(option, bench)[0] for option in options]
+    unlike = [
+        option
+        for option, term in zip(options, terms, strict=True)
+        if not any(_is_related(term, other) for other in bench.effects)
+    ]
+    if not unlike:
+        raise ConfigError(f"--hide {text}: the bench already has effects like all of these")
+    return unlike[rng.integers(len(unlike))]
 
 
 def _with_effect(
@@ -187,11 +214,16 @@ def _refuse_weak_hold(effect: Effect, values: Mapping[str, float], *, where: str
 def _refuse_second(term: EffectTerm, present: Sequence[EffectTerm], *, where: str) -> None:
     """Refuse an effect if it, or another of its family, is already hidden at the same place."""
     for other in present:
-        related = other.effect.family and other.effect.family == term.effect.family
-        if other.place == term.place and (other.effect is term.effect or related):
+        if other.place == term.place and _is_related(term, other):
             raise ConfigError(
                 f"{where}: {_at(other) or 'the input'} already has {other.effect.key}"
             )
+
+
+def _is_related(term: EffectTerm, other: EffectTerm) -> bool:
+    """Return whether two effects are the same, or of one family."""
+    family = term.effect.family
+    return other.effect is term.effect or bool(family and other.effect.family == family)
 
 
 def _session_scales(

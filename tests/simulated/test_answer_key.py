@@ -83,6 +83,36 @@ def test_another_bench_does_not_replace_the_answers_of_a_team(teams, tmp_path):
     assert (teams / "key.json").read_bytes() == before
 
 
+def test_one_of_several_effects_is_drawn(tmp_path):
+    """The key draws the effect; the same key draws it again; both draws of a bench are unlike."""
+    options = "coulomb_friction/presliding_friction/input_delay/dead_zone:width=0.1"
+    drawn = []
+    for again in ("first", "again"):
+        secret = tmp_path / f"{again}.json"
+        secret.write_text(json_text(AnswerKey(secret="0123456789abcdef", teams={})), "utf-8")
+        out = tmp_path / again / "a"
+        assert simulate(out, secret, "--hide", options, "--hide", options).returncode == 0
+        drawn.append(read_key(secret).teams["a"].model.terms)
+    assert json_text(drawn[0]) == json_text(drawn[1])
+    assert len({term.effect.family or term.effect.key for term in drawn[0]}) == 2
+    seen = [
+        prepare_bench(preset="throne-1dof", hide=[options], rng=np.random.default_rng(n)).effects[0]
+        for n in range(40)
+    ]
+    assert len({term.effect.key for term in seen}) == 4
+    assert {term.parameters["width"] for term in seen if term.effect.key == "dead_zone"} == {0.1}
+
+
+@pytest.mark.parametrize("hide", ["input_delay/dead_zon", "dead_zone/", "dead_zone/dead_zone"])
+def test_alternatives_are_checked_whichever_is_drawn(hide):
+    """An unknown effect among the alternatives, or only effects that are there, are refused."""
+    rng = np.random.default_rng(0)
+    with pytest.raises(ConfigError):
+        prepare_bench(preset="throne-1dof", hide=["dead_zone", hide], rng=rng)
+    with pytest.raises(ConfigError):
+        prepare_bench(preset="throne-1dof", hide=["dead_zone/input_delay"])
+
+
 def test_drawn_values_fill_the_range():
     """Factors lie within the percentage and use its whole width; no effect changes its sign."""
     hidden = ("stiction:cart=1", "sensor_gain:cart=1,gain=1.1", "end_stop:cart=1,position=-0.8")

@@ -14,7 +14,9 @@ from typer.main import get_command
 
 from pipeline.cli import app, main
 from pipeline.cli.common import MORE, ROLES
+from pipeline.json_files import json_text
 from pipeline.resources import EXAMPLES
+from pipeline.simulated.answer_key import AnswerKey
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.places import ROOT
 
@@ -142,9 +144,12 @@ def conclusions(team: Path) -> str:
 def test_the_page_on_a_course_works(monkeypatch, tmp_path):
     """What the commands of the page show of a team's bench earns all points for its effect.
 
-    A team that copies the numbers of its neighbour loses most of them.
+    A team that copies the numbers of its neighbour loses most of them. This key draws another
+    effect for each.
     """
     monkeypatch.chdir(tmp_path)
+    key = AnswerKey(secret="course", teams={})
+    Path("key.json").write_text(json_text(key), encoding="utf-8")
     teams = [Path("teams", name) for name in ("team-1", "team-2")]
     for arguments, status, _ in examples(ROOT / "docs" / "course.md"):
         if arguments[0] == "grade":
