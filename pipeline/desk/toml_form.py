@@ -39,7 +39,8 @@ class Field:
     path : path of the key in the file; tables in a list have their number.
     input : name of the HTML input, if it is not the path.
     kind : text, words (of several lines), number, numbers, rows (of numbers, one per line), flags,
-        authors or columns; amount, a number in its shortest form; or share, an amount in percent.
+        authors, columns or effect; amount, a number in its shortest form; or share, an amount in
+        percent.
     unit : the unit of an amount.
     choices : the possible values; "" means that the key is left out.
     names : the names of the flags.

@@ -420,11 +420,11 @@ def _effect_problems(
     places = [] if effect.place == "input" else [effect.place]
     for name in stated:
         if name not in names + places:
-            yield at, f"unknown parameter {name!r}{nearest(name, names + places)}"
+            yield (*at, name), f"unknown parameter{nearest(name, names + places)}"
     for place in places:
         last = n if place == "cart" else n + 1
         if place in stated and stated[place] not in range(1, last + 1):
-            yield at, f"there is no {place} {stated[place]}; expected 1 to {last}"
+            yield (*at, place), f"there is no {place} {stated[place]}; expected 1 to {last}"
 
 
 def _decimals(found: int, n: int) -> str:

@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.desk.student.folder_tasks import read_document
-from pipeline.desk.student.form import Fault, fill_experiment, fill_form, mark_errors, write_fields
+from pipeline.desk.student.form import (
+    Fault,
+    fill_experiment,
+    fill_form,
+    mark_errors,
+    summarise,
+    write_fields,
+)
 from pipeline.desk.toml_form import Field, find_changes
 from pipeline.errors import SubmissionError
 from pipeline.resources import EXAMPLES
@@ -93,6 +100,61 @@ def test_every_kind_of_field_is_written_and_read_back():
     empty = changed(gone, **dict.fromkeys(given, ""))
     assert "A" not in tomllib.loads(empty)["reported"]["state_space"]
     assert "columns" not in tomllib.loads(empty)["system"]
+
+
+def test_an_effect_is_chosen_filled_in_exchanged_and_removed():
+    """A chosen effect gets fields for its place and sizes; without effects, the file is as before.
+
+    A value for an effect that is exchanged in the same form is not written.
+    """
+    friction, delay = "Dry (Coulomb) friction", "Delay of the input"
+    at = "reported.effects.coulomb_friction"
+    chosen = changed(WHOLE, **{"reported.effects": friction})
+    shown = [path for path in fields(chosen) if path.startswith("reported.effects")]
+    assert shown == [at, f"{at}.cart", f"{at}.force", "reported.effects"]
+    typed = changed(chosen, **{f"{at}.cart": "2", f"{at}.force": "0.0310"})
+    (group,) = (one for one in fill_form(read_document(typed)) if one.key == "effects")
+    assert [summarise(group).summary, summarise(group).missing] == [friction, ""]
+    submission = parse_submission(typed, folder=EXAMPLES / "two-cart")
+    assert submission.reported is not None
+    effects = submission.reported.effects
+    assert effects is not None
+    assert [*map(str, effects["coulomb_friction"].values())] == ["2", "0.0310"]
+    other = changed(typed, **{at: delay, f"{at}.force": "5"})
+    assert tomllib.loads(other)["reported"]["effects"] == {"input_delay": {}}
+    gone = changed(other, **{"reported.effects.input_delay": ""})
+    assert tomllib.loads(gone) == tomllib.loads(WHOLE)
+
+
+@pytest.mark.parametrize("above", ["", "effects = {}\n", "effects.input_delay.delay = 0.02\n"])
+def test_an_effect_is_added_to_any_form_of_the_table(above):
+    """The table may be missing, on one line, or written with dots."""
+    text = changed(
+        f"version = 1\n[reported]\n{above}", **{"reported.effects": "Dead zone of the input"}
+    )
+    effects = tomllib.loads(text)["reported"]["effects"]
+    assert effects["dead_zone"] == {}
+    assert len(effects) == 1 + ("delay" in above)
+
+
+def test_an_effect_s_mistake_stands_at_its_field():
+    """A wrong cart or size is marked at its own field, an unknown effect at the choice."""
+    added = changed(WHOLE, **{"reported.effects": "Dry (Coulomb) friction"})
+    for path, value, at in (
+        ("reported.effects.coulomb_friction.cart", "5", "reported.effects.coulomb_friction.cart"),
+        (
+            "reported.effects.coulomb_friction.force",
+            "0,1",
+            "reported.effects.coulomb_friction.force",
+        ),
+        ("reported.effects", "magnetism", "reported.effects"),
+    ):
+        with pytest.raises(SubmissionError) as refused:
+            parse_submission(changed(added, **{path: value}), folder=EXAMPLES / "two-cart")
+        fault = Fault.of(refused.value)
+        shown, left = mark_errors(list(fields(added).values()), (), fault)
+        assert [field.path for field in shown if field.wrong] == [at]
+        assert left == []
 
 
 @pytest.mark.parametrize(

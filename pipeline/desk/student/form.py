@@ -1,6 +1,6 @@
 """The form of `submission.toml`: its groups of fields, and doubts as questions with answers."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import is_known, position_units
 from pipeline.ingest.fill import UNSURE, unit_doubt
 from pipeline.names import parameter_names, read_name
+from pipeline.plant.catalogue import CATALOGUE
 from pipeline.setup import Units
 from pipeline.submission import Submission
 from pipeline.submission.edit import comment_text
@@ -29,7 +30,7 @@ from pipeline.words.numbers import count, listing
 from pipeline.words.text import symbol_text
 
 # The groups of the form: key, title, keys of the file. Before the last group comes a group for the
-# parameters, whose names depend on the number of carts.
+# parameters, whose names depend on the number of carts. After it comes a group for effects.
 _GROUPS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("who", "Who and what", ("title", "section", "authors")),
     (
@@ -130,8 +131,48 @@ def fill_form(document: Mapping[str, Any]) -> list[Group]:
         for name in parameter_names(carts, rigid=rigid)
         for which in ("initial", "final")
     )
-    groups = [*first, Group(key="numbers", title="Your numbers", fields=claims), last]
+    groups = [
+        *first,
+        Group(key="numbers", title="Your numbers", fields=claims),
+        last,
+        Group(
+            key="effects",
+            title="Effects beyond the linear model",
+            fields=tuple(_describe_effects(document, units)),
+        ),
+    ]
     return [replace(group, fields=_fill(group.fields, document)) for group in groups]
+
+
+def _describe_effects(document: Mapping[str, Any], units: Units) -> Iterator[Field]:
+    """Yield the fields of each effect in the file, and an empty choice for one more effect.
+
+    A field of the kind `effect` chooses an effect by its title.
+    """
+    known = {effect.key: effect for effect in CATALOGUE}
+    titles = ("", *(effect.title for effect in CATALOGUE))
+    stated = find_value(document, "reported.effects")
+    stated = stated if isinstance(stated, Mapping) else {}
+    chosen = [known[key] for key in stated if key in known]
+    for effect in chosen:
+        table = f"reported.effects.{effect.key}"
+        yield Field(path=table, label="Effect", kind="effect", choices=titles, value=effect.title)
+        names = [] if effect.place == "input" else [(effect.place, "counted from the side of the motor")]
+        names += [
+            (p.name, p.unit_text(position=units.position, input=units.input))
+            for p in effect.parameters
+            if p.reported
+        ]
+        for name, help in names:
+            label = f"{effect.title}: {name.replace('_', ' ')}"
+            yield Field(path=f"{table}.{name}", label=label, help=help, kind="number")
+    yield Field(
+        path="reported.effects",
+        label="Another effect" if chosen else "Effect that you found",
+        help="its place and size are asked for after you save",
+        kind="effect",
+        choices=titles,
+    )
 
 
 def fill_experiment(document: Mapping[str, Any], index: int) -> tuple[Field, ...]:
@@ -181,7 +222,8 @@ def mark_errors(
     if fault is not None and not fault.problems:
         left.append(fault.text)
     for path, what in fault.problems if fault else ():
-        place = next((i for i, f in enumerate(shown) if f"{path}.".startswith(f"{f.path}.")), None)
+        above = [i for i, f in enumerate(shown) if f"{path}.".startswith(f"{f.path}.")]
+        place = max(above, key=lambda i: len(shown[i].path), default=None)
         if place is None:
             left.append(what)
         elif not shown[place].wrong:
@@ -201,7 +243,10 @@ def count_carts(document: Mapping[str, Any]) -> int:
 def _fill(fields: Iterable[Field], document: Mapping[str, Any]) -> tuple[Field, ...]:
     springs = tuple(spring_names(count_carts(document)))
     named = (replace(f, names=springs if f.kind == "flags" else ()) for f in fields)
-    return tuple(replace(field, value=read_value(document, field)) for field in named)
+    return tuple(
+        field if field.kind == "effect" else replace(field, value=read_value(document, field))
+        for field in named
+    )
 
 
 # --------------------------------------------------------------- from the form to the file
@@ -209,9 +254,15 @@ def _fill(fields: Iterable[Field], document: Mapping[str, Any]) -> tuple[Field, 
 
 def write_fields(document: tomlkit.TOMLDocument, changed: Iterable[Field]) -> None:
     """Write typed values into a document; an empty field removes its key."""
+    changed = list(changed)
+    replaced = tuple(f"{f.path}." for f in changed if f.kind == "effect" and f.path.count(".") > 1)
     for field in changed:
         if field.path == "authors":
             _set_authors(document, field.value)
+        elif field.kind == "effect":
+            _set_effect(document, field)
+        elif field.path.startswith(replaced):
+            continue  # of an effect that was replaced or removed
         else:
             # These two keys stay without a value, because they have comments in a new file.
             write_field(document, field, keep_empty=field.path in ("title", "section"))
@@ -280,6 +331,17 @@ def _set_authors(document: tomlkit.TOMLDocument, text: str) -> None:
                 set_item(tables[i], [key], tomlkit.item(value) if value else None)
     while len(tables) > len(people):
         del tables[len(tables) - 1]
+
+
+def _set_effect(document: tomlkit.TOMLDocument, field: Field) -> None:
+    """Write an empty table for the effect whose title was chosen, in place of the field's own."""
+    parts = field.path.split(".")
+    if parts[2:]:
+        set_item(document, parts, None)
+    if field.value:
+        key = next((one.key for one in CATALOGUE if one.title == field.value), field.value)
+        # On one line, because tomlkit can add such a table to any kind of table.
+        set_item(document, ["reported", "effects", key], tomlkit.inline_table())
 
 
 def _make_author(id_: str, name: str) -> Any:
@@ -483,10 +545,18 @@ def _say_model(group: Group, values: Mapping[str, str]) -> _Said:
     return [field.label for field in group.fields if field.value] or ["none"], ""
 
 
+def _say_effects(group: Group, values: Mapping[str, str]) -> _Said:
+    *stated, _ = group.fields
+    lacks = any(not field.value for field in stated)
+    chosen = [field.value for field in stated if field.kind == "effect"]
+    return chosen or ["none"], "place and size" if lacks else ""
+
+
 _SAY = {
     "who": _say_who,
     "bench": _say_bench,
     "design": _say_design,
     "numbers": _say_numbers,
     "model": _say_model,
+    "effects": _say_effects,
 }
