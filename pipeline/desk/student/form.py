@@ -157,7 +157,7 @@ def _describe_effects(document: Mapping[str, Any], units: Units) -> Iterator[Fie
     for effect in chosen:
         table = f"reported.effects.{effect.key}"
         yield Field(path=table, label="Effect", kind="effect", choices=titles, value=effect.title)
-        names = [] if effect.place == "input" else [(effect.place, "counted from the side of the motor")]
+        names = [] if effect.place == "input" else [(effect.place, "counted from the motor")]
         names += [
             (p.name, p.unit_text(position=units.position, input=units.input))
             for p in effect.parameters
