@@ -3,8 +3,8 @@
     python -m benchmarks.faults [--suite] [FILE …] [NUMBER …]
 
 One fault of `faults.toml` at a time is put into a copy of this checkout. The tests of its own room
-run until one fails, for at most a minute: first those that import the faulty module, then those
-whose path is most like it. With `--suite`, the default suite and its sample follow if no test
+run until one fails, for at most 20 s: first those that import the faulty module, then those whose
+path is most like it. With `--suite`, the default suite and its sample follow if no test
 failed. The list stays true, because a fragment that is not found exactly once is refused. Seconds
 are those of a processor.
 """
@@ -15,15 +15,21 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 import tomllib
 from collections.abc import Sequence
+from inspect import getsource
 from pathlib import Path
 from typing import NamedTuple
+
+import pytest
 
 CHECKOUT = Path(__file__).parents[1]
 LIST = Path(__file__).with_suffix(".toml")
 _LEFT = shutil.ignore_patterns(".git", ".*_cache", ".venv", "site", "build", "dist")
-_ROOM_SECONDS, _SUITE_SECONDS = 60.0, 3600.0  # after these a fault counts as unnoticed
+_ROOM_SECONDS, _SUITE_SECONDS = 20.0, 3600.0  # of a processor; then a fault counts as unnoticed
+_NEAREST = 12  # files of a room; there is no time for more
+_LIMIT, _NAMES = "CARTLAB_FAULT_SECONDS", "CARTLAB_FAULT_IN"  # tell a run its time and functions
 _WIDER = {"suite": "not slow", "sample": "slow and sample"}
 
 
@@ -60,23 +66,54 @@ def order_files(fault: Fault, checkout: Path) -> list[str]:
     package, _, name = module.rpartition(".")
     imports = re.compile(rf"(import|from) {module}\b|from {package} import [^#]*?\b{name}\b")
     parts = set(re.split(r"[/_.]", fault.file)) - {"py"}
+    names = re.compile("|".join([rf"\b{name}\b" for name in name_functions(fault)] or [r"\b\B"]))
 
-    def distance(file: Path) -> tuple[bool, int, int]:
+    def distance(file: Path) -> tuple[int, int, int]:
+        text = file.read_text("utf-8")
         words = set(re.split(r"[/_.]", file.relative_to(checkout / "tests").as_posix()))
-        return not imports.search(file.read_text("utf-8")), -len(parts & words), file.stat().st_size
+        near = bool(imports.search(text)) + bool(names.search(text))
+        return -near, -len(parts & words), len(text)
 
     files = sorted((checkout / "tests" / fault.tests).rglob("test_*.py"), key=distance)
-    return [file.relative_to(checkout).as_posix() for file in files]
+    return [file.relative_to(checkout).as_posix() for file in files[:_NEAREST]]
 
 
-def run_tests(tests: Sequence[str], checkout: Path, *, marked: str, most: float) -> Outcome:
-    """Run tests one after the other until one fails, for at most `most` seconds."""
+def name_functions(fault: Fault) -> list[str]:
+    """Name the function or class with the fault, then those of its file that use it."""
+    text = (CHECKOUT / "pipeline" / fault.file).read_text("utf-8")
+    named, top, in_class = dict[str, str](), "", False
+    for block in re.split(r"^(?= {0,4}(?:def|class) )", text, flags=re.MULTILINE)[1:]:
+        indent, kind, name = re.match(r"( *)(\w+) (\w+)", block).groups()  # type: ignore[union-attr]
+        top, in_class = (top, in_class) if indent else (name, kind == "class")
+        name = name if in_class and name[:2] != "__" else top
+        named[name] = named.get(name, "") + block
+    names = [name for name, block in named.items() if fault.old in block]
+    for used in names:  # which grows
+        using = (name for name, block in named.items() if re.search(rf"\b{used}\b", block))
+        names += [name for name in using if name not in names]
+    return names
+
+
+def run_tests(
+    tests: Sequence[str],
+    checkout: Path,
+    *,
+    marked: str = "not slow",
+    most: float,
+    about: Sequence[str] = (),
+) -> Outcome:
+    """Run tests until one fails, first those `about` a function, for `most` processor seconds."""
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider"]
     command += ["-p", "benchmarks.faults", "-m", marked, *tests]
-    began, environment = sum(os.times()[2:4]), os.environ | {"PYTHONPATH": str(checkout)}
+    environment = os.environ | {
+        "PYTHONPATH": str(checkout),
+        _LIMIT: str(most),
+        _NAMES: " ".join(about),
+    }
+    began = sum(os.times()[2:4])
     with subprocess.Popen(command, cwd=checkout, env=environment, stdout=subprocess.PIPE) as run:
         try:
-            said = run.communicate(timeout=most)[0].decode(errors="replace")
+            said = run.communicate(timeout=10 * most)[0].decode(errors="replace")
         except subprocess.TimeoutExpired:
             run.terminate()
             said = ""
@@ -86,10 +123,26 @@ def run_tests(tests: Sequence[str], checkout: Path, *, marked: str, most: float)
     return Outcome(test=failed[1] if failed else "", seconds=sum(os.times()[2:4]) - began)
 
 
+# ------------------------------------------------- as a plugin of pytest, in the runs of the tests
+
+
 def pytest_collection_modifyitems(config, items: list) -> None:
-    """Keep the order of the files as given: this module is a plugin of pytest in its runs."""
+    """Put the tests first that name the faulty function, then those of its users."""
     place = {Path(name).resolve(): i for i, name in enumerate(config.args)}
-    items.sort(key=lambda item: place.get(item.path.resolve(), 0))
+    names = [re.compile(rf"\b{name}\b") for name in os.environ[_NAMES].split()]
+
+    def rank(item) -> tuple[int, int]:
+        text = getsource(item.obj)
+        found = (i for i, name in enumerate(names) if name.search(text))
+        return next(found, len(names)), place.get(item.path.resolve(), 0)
+
+    items.sort(key=rank)
+
+
+def pytest_runtest_setup() -> None:
+    """Skip the tests for which no time is left."""
+    if time.process_time() > float(os.environ[_LIMIT]):
+        pytest.skip("the time is over")
 
 
 def judge_fault(fault: Fault, checkout: Path, *, wider: bool) -> dict[str, Outcome]:
@@ -99,7 +152,8 @@ def judge_fault(fault: Fault, checkout: Path, *, wider: bool) -> dict[str, Outco
     path.write_text(right.replace(fault.old, fault.new), "utf-8")
     try:
         own = order_files(fault, checkout)
-        runs = {"room": run_tests(own, checkout, marked="not slow", most=_ROOM_SECONDS)}
+        about = name_functions(fault)
+        runs = {"room": run_tests(own, checkout, most=_ROOM_SECONDS, about=about)}
         for name, marked in _WIDER.items() if wider else ():
             if not any(one.test for one in runs.values()):
                 runs[name] = run_tests(["tests"], checkout, marked=marked, most=_SUITE_SECONDS)

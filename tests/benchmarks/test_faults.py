@@ -38,6 +38,6 @@ def test_only_a_failing_test_notices(claim, test, tmp_path):
     (tmp_path / "tests").mkdir()
     (tmp_path / "tests" / "test_it.py").write_text(f"def test_it():\n    assert {claim}\n")
 
-    outcome = faults.run_tests(["tests/test_it.py"], tmp_path, marked="not slow", most=60.0)
+    outcome = faults.run_tests(["tests/test_it.py"], tmp_path, most=60.0)
 
     assert outcome.test == test
