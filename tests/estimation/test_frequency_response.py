@@ -161,6 +161,16 @@ def test_stated_errors_of_a_response_are_right(preset, drive):
         assert response.omega.size > 50
 
 
+@pytest.mark.parametrize("drive", ["chirp", "random"])
+def test_errors_of_a_response_in_motion_are_not_stated_too_large(drive):
+    """If a record begins and ends in motion, the spread of its response is the stated error."""
+    t, u, kind = DRIVES[drive]
+    chain = PRESETS["throne-1dof"]
+    (response,) = response_from_records([record(chain, t, u(t), kind=kind, noise=COUNT_NOISE)])
+    # The rms of 100 or more standardised errors is within 1 ± 0.2.
+    assert 0.7 < np.sqrt(np.mean(errors(chain, response) ** 2)) < 1.25
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_rounding_alone_gives_the_stated_errors(preset):
     """Without noise, the errors of a response are those of the encoder's rounding, step/√12."""

@@ -98,6 +98,17 @@ def test_heavy_damping_still_gives_an_answer(zeta):
         assert got.zeta_peaks_std > 0
 
 
+def test_the_error_of_zeta_from_peaks_follows_from_that_of_the_decrement():
+    """The error of `zeta` is that of δ times dζ/dδ."""
+    got = fit_log_decrement(released(zeta=0.08, noise=COUNT, rng=np.random.default_rng(2)), cart=1)
+
+    def zeta(delta: float) -> float:
+        return delta / np.hypot(2 * np.pi, delta)
+
+    slope = (zeta(got.delta + 1e-4) - zeta(got.delta - 1e-4)) / 2e-4
+    assert_allclose(got.zeta_peaks_std, slope * got.delta_std, rtol=1e-6)
+
+
 def test_the_figure_shows_the_fit_within_its_envelope():
     """In the figure, the decay stays within its envelope, and both have the same times."""
     got = fit_log_decrement(released(zeta=0.05), cart=1)

@@ -229,3 +229,17 @@ def test_the_standard_errors_are_about_right():
     """Over 60 dwells, actual errors are about as large as the standard errors."""
     spread = np.sqrt(np.mean(coverage(60, from_rest=False) ** 2, axis=0))
     assert np.all((0.75 < spread) & (spread < 1.35))  # the limits are 1 ± 4/sqrt(120)
+
+
+@pytest.mark.parametrize("size", [3.0, 10.0, 30.0])
+def test_the_error_of_a_small_amplitude_is_that_of_its_rounding(size):
+    """Over 40 exact sines of a few counts, errors of the amplitude are as its standard error."""
+    errors, t = [], sampled(9.0)
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        omega, amplitude = 2 * np.pi * rng.uniform(1.0, 3.0), size * COUNT * rng.uniform(1.0, 1.1)
+        y = amplitude * np.sin(omega * t + rng.uniform(0.0, 6.0)) + COUNT * rng.uniform()
+        got = Dwell(record_of(t, np.sin(omega * t), y[None], kind="sine", omega=omega)).fit(cart=1)
+        errors.append((got.amplitude - amplitude) / got.amplitude_std)
+    # Without the error of rounding, the spread is 1.7 to 3.8.
+    assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.4

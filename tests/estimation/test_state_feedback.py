@@ -65,6 +65,17 @@ def design(
     return design_feedback(chain, task)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_quarter_of_the_step_may_use_a_quarter_of_the_input(method):
+    """A design near its input limit is the same for a smaller step with a smaller limit."""
+    chain = PRESETS["throne-2dof"]
+    limit = 1.05 / float(chain.static_gains()[-1])
+    whole = design(chain, cart=2, limit=limit, method=method)
+    quarter = design(chain, cart=2, reference=0.25, limit=0.25 * limit, method=method)
+    assert 0.9 * limit < whole.peak_input <= limit
+    assert_allclose(quarter.gains, whole.gains, rtol=1e-7)
+
+
 def off_by(chain: Chain, rng: np.random.Generator) -> Chain:
     """Return the chain with errors of up to 3 % in masses and springs and 30 % in dampings."""
     return Chain(

@@ -178,6 +178,20 @@ def test_noise_is_averaged(noise):
     assert got.gain_std < noise * COUNT / 0.03 / 1.5  # below the noise of a single sample
 
 
+def test_edges_that_disagree_have_the_error_of_their_mean():
+    """If the gains of three edges scatter, `fit_static_gain` states the error of their mean."""
+    t, levels = seconds(16.0), (1.0, 1.9, 3.0)
+    u = staircase(t, *((4.0 * i, 0.03 * i) for i in (1, 2, 3)))
+    y, before = np.zeros_like(t), 0.0
+    for i, level in enumerate(levels, start=1):
+        after = t >= 4.0 * i
+        y[after], before = level + (before - level) * np.exp(-8 * (t[after] - 4.0 * i)), level
+    got = fit_static_gain(record(t, u, y[None]), cart=1)
+    gains = np.diff([0.0, *levels]) / 0.03
+    assert_allclose(got.gain, gains.mean(), rtol=0.03)
+    assert_allclose(got.gain_std, np.std(gains, ddof=1) / np.sqrt(3), rtol=0.3)
+
+
 # ----------------------------------------------------------------------- friction
 
 

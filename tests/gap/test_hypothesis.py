@@ -59,3 +59,13 @@ def test_more_than_noise_may_mean_missing_effects(error, contact, repeatability,
     chosen: Any = SimpleNamespace(error=error, has_contact=contact)
     study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
     assert Study.may_be_half(study, chosen) == said
+
+
+@pytest.mark.parametrize(
+    ("error", "repeatability", "explained"),
+    [(0.0199, 0.0, True), (0.0201, 0.0, False), (0.0299, 0.02, True), (0.0301, 0.02, False)],
+)
+def test_noise_and_repeats_excuse_an_error(error, repeatability, explained):
+    """`explains` allows twice the noise or 1.5 times the repeats, whichever is larger."""
+    study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
+    assert Study.explains(study, SimpleNamespace(error=error)) == explained  # type: ignore[arg-type]

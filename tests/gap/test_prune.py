@@ -77,3 +77,19 @@ def test_an_effect_of_zero_within_its_error_is_not_significant(value, nothing):
     (found,) = significance(replace(known, covariance=sure))
     assert (found < SURE) == nothing
     assert significance(known) == [np.inf]  # without a standard error it counts as significant
+
+
+@pytest.mark.parametrize(("gain", "nothing"), [(1.05, False), (1.001, True), (0.95, False)])
+def test_a_sensor_gain_is_significant_by_its_distance_from_one(gain, nothing):
+    """With a standard error of 0.01, only a gain far from 1 is significant."""
+    fit, study = begun()
+    chain = fit.structure.chain(fit.theta)
+    effect = find_effect("sensor_gain")
+    sensor = make_candidate(effect, 1, (gain,), runs=study.training, chain=chain)
+    model = fit.with_effect(sensor, (gain,))
+    known = replace(fit, structure=model.structure, theta=model.theta)
+    by_theta = known.structure.physical_derivative(known.theta)
+    sure = np.diag((0.01 / np.where(by_theta == 0, 1.0, by_theta)) ** 2)
+
+    (found,) = significance(replace(known, covariance=sure))
+    assert (found < SURE) == nothing

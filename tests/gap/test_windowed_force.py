@@ -1,20 +1,28 @@
 """Laws that are not in the catalogue are found from the unexplained force."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from pipeline.arrays import Array
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit import fit_baseline, fit_nuisance
-from pipeline.gap.residual import map_residual, windowed_residual_forces
+from pipeline.gap.residual import (
+    LIBRARY,
+    map_residual,
+    residual_forces,
+    windowed_residual_forces,
+)
 from pipeline.gap.runs import prepare, split_holdout
 from pipeline.gap.types import Residual
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
 from pipeline.results import ExperimentKind, Record
 from pipeline.setup import Setup
+from tests.helpers.gaps import make_gap
 from tests.helpers.time_records import COUNT, record_of
 
 # Arguments: position, velocity and input of each run at one time; result: the force in each run.
@@ -130,3 +138,33 @@ def test_an_effect_that_the_catalogue_lacks_is_described():
     assert residual.formula.terms[0].term == "v|v|"
     assert residual.formula.terms[0].unit == "V s^2/cm^2"
     assert {force.experiment for force in gap.left_forces} == {*gap.training, *gap.held_out}
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("1", "V"),
+        ("x^2", "V/cm^2"),
+        ("v|v|", "V s^2/cm^2"),
+        ("x v", "V s/cm^2"),
+        ("|u|", "1"),
+        ("u x", "1/cm"),
+        ("u v", "s/cm"),
+    ],
+)
+def test_the_unit_of_a_coefficient_makes_a_force(name, expected):
+    """Coefficient times term is a force, so the unit of a term with the input has no volt."""
+    (term,) = (one for one in LIBRARY if one.name == name)
+    assert term.unit(position="cm", drive="V") == expected
+
+
+def test_the_zero_of_an_encoder_is_no_force():
+    """`residual_forces` are the same if all readings of a run are shifted with their zero."""
+    gap, free = make_gap(), {"step-a": (1, 2), "step-b": (1, 2)}
+    shifted = tuple(
+        replace(t, measured=t.measured + 0.3, final=t.final + 0.3, zero=0.3) for t in gap.traces
+    )
+    plain, moved = (residual_forces(one, free=free) for one in (gap, replace(gap, traces=shifted)))
+    for before, after in zip(plain, moved, strict=True):
+        for name in ("measured", "model", "position", "neighbours"):
+            assert_allclose(getattr(after, name), getattr(before, name), atol=1e-12)

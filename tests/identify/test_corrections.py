@@ -20,7 +20,7 @@ from pipeline.results import Record
 from pipeline.setup import Setup
 from pipeline.words.progress import silent
 from tests.helpers.analysis_factory import make_analysis
-from tests.helpers.time_records import decay_record, step_record
+from tests.helpers.time_records import decay_record, record_of, step_record
 
 CHAIN = PRESETS["throne-2dof"]
 TENTH = Correction(words="a tenth as far", scale=0.1)
@@ -174,3 +174,13 @@ def test_no_cart_moves_much_further_than_the_cart_that_pulls_it(gain, wrong):
     found = find_impossible_gains(gains)
     expected = [("step-1", 2, "too_far", "wrong")] if wrong else []
     assert [(one.run, one.cart, one.code, one.excludes) for one in found.values()] == expected
+
+
+@pytest.mark.parametrize(("cycles", "short"), [(0.5, True), (1.45, True), (1.6, False)])
+def test_a_dwell_needs_more_than_a_cycle(cycles, short):
+    """A dwell of less than 1.5 cycles has no steady state, whatever its length in seconds."""
+    t, omega = np.arange(0.0, 6.0, 0.01), 2 * np.pi * cycles / 6.0
+    wave = np.sin(omega * t)
+    run = record_of(t, wave, wave[None], kind="sine", id="dwell", omega=omega)
+    found = find_faults([run], chain=None, fits={})
+    assert [one.code for one in found.values()] == ["short_dwell"] * short

@@ -9,6 +9,7 @@ from pipeline.arrays import Array
 from pipeline.identify.recording_checks import (
     check_setup,
     find_bad_recordings,
+    find_shown,
     gain_sign_warning,
 )
 from pipeline.results import Record
@@ -44,6 +45,24 @@ def test_a_cart_stated_as_held_must_hardly_move(swing, code):
 
 
 @pytest.mark.parametrize(
+    ("on", "code"),
+    [
+        ((0.0, 0.0), ""),
+        ((0.0, 2.0), ""),
+        ((3.0, 8.0), "driven_decay"),
+        ((6.0, 8.0), "driven_decay"),
+    ],
+)
+def test_a_decay_is_free_in_its_second_half(on, code):
+    """In a decay the input may release the cart, but not act on it later (`_another_input`)."""
+    u = np.where((on[0] <= T) & (on[1] > T), 1.0, 0.0)
+    run = record_of(T, u, np.stack([WAVE]), kind="decay", id="decay", count=1e-3)
+    other = record_of(T, WAVE, np.stack([WAVE]), kind="sweep", id="sweep", count=1e-3)
+    found = find_shown([run, other], files={})
+    assert [one.code for one in found.values()] == [code] * bool(code)
+
+
+@pytest.mark.parametrize(
     ("free", "limits", "explained", "code"),
     [
         ((1, 2), (0.6, np.inf, np.inf), True, "clipped_position"),
@@ -66,6 +85,24 @@ def test_clipped_signals_are_found(free, limits, explained, code):
         left_out=(),
         late_channels=(),
     )
+    assert [one.code for one in find_bad_recordings(analysis).values()] == [code] * bool(code)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "stated", "code"),  # the stated frequency, over that of the input
+    [
+        (10.0, 1.0, ""),
+        (10.0, 1.06, ""),
+        (10.0, 1.3, "other_frequency"),
+        (10.0, 0.7, "other_frequency"),
+        (2.0, 1.3, ""),  # too short to tell the two frequencies apart
+    ],
+)
+def test_a_dwell_of_another_frequency_is_found_if_it_is_long_enough(seconds, stated, code):
+    """The frequencies must differ by more than 8 %, and by more than the record can resolve."""
+    run, analysis = dwell(np.stack([WAVE, WAVE])), make_analysis(2)
+    short = replace(run, omega=stated * OMEGA).part(slice(0, round(100 * seconds)))
+    analysis = replace(analysis, records=(short,), left_out=(), late_channels=())
     assert [one.code for one in find_bad_recordings(analysis).values()] == [code] * bool(code)
 
 

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.ingest.clock import decimal_step, read_clock, read_clocks
+from pipeline.ingest.clock import decimal_step, read_clock, read_clocks, time_stamps
+from pipeline.ingest.files import parse_table
 
 
 @settings(deadline=None)
@@ -190,3 +191,9 @@ def test_dropped_samples_do_not_bend_the_shared_period():
     assert {clock.period for clock in clocks} == {clocks[0].period}
     assert clocks[0].period == pytest.approx(0.0011279, rel=1e-3 / 120)
     assert np.abs(clocks[9].t - lost).max() < 1e-3
+
+
+def test_a_stated_rate_gives_even_stamps():
+    """Without a time column, `time_stamps` are those of the stated rate in Hz."""
+    table = parse_table(b"x1\n" + b"1\n2\n" * 10, source="a.csv")
+    assert_allclose(time_stamps(table, None, sample_rate=200.0), 0.005 * np.arange(20))

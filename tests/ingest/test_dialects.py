@@ -264,6 +264,9 @@ def test_every_unit_has_its_size():
         ("\u22120.5", False, -0.5),
         ("12:30:15", False, 45_015.0),
         ("0:00:01.25 PM", False, 43_201.25),
+        ("12:30:00 pm", False, 45_000.0),
+        ("12:30:00 AM", False, 1_800.0),
+        ("1:00:00 pm", False, 46_800.0),
     ],
 )
 def test_a_cell_is_read_as_typed(typed, comma, number):

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import SubmissionError
 from pipeline.identify.recording_checks import check_signs, check_units
+from pipeline.ingest.bode_table import frequency_responses
 from pipeline.ingest.read import DUTY_COUNT, Ingested, read_data
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
@@ -534,6 +535,17 @@ def test_repeats_in_a_bode_table_give_its_standard_errors(tmp_path):
     # With 300 degrees of freedom a standard deviation is accurate to 1/sqrt(600) = 4 %. The limit
     # is three times that.
     assert_allclose(response.magnitude_std / response.magnitude, 0.03 / 2, rtol=0.12)
+
+
+@pytest.mark.parametrize("repeats", [4, 9])
+def test_the_error_of_a_ratio_falls_with_the_root_of_its_repeats(repeats):
+    """The `frequency_responses` of a table have the spread of one ratio over √(repeats)."""
+    ratios = [2.0 * np.exp(0.03 * (-1) ** i) for i in range(repeats)]
+    points = {1: [(5.0, ratio) for ratio in ratios] + [(9.0, 1.0)]}
+    ((response,), _) = frequency_responses(points)
+    spread = np.std(np.log(ratios), ddof=1)
+    relative = response.magnitude_std / response.magnitude
+    assert_allclose(relative, [spread / np.sqrt(repeats), spread])
 
 
 def test_a_bode_table_may_be_in_rad_per_s_and_db(tmp_path):

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from pipeline.ingest.jumps import repair_positions
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
 from tests.helpers.recordings import facts
 
 N = 1200
-T = 0.005 * np.arange(N)
+T = 0.005 * np.arange(N, dtype=np.float64)
 U = np.where(T > 0.5, 1.0, 0.0)
 RNG = np.random.default_rng(3)
 X = 2 * U * (1 - np.exp(-2 * (T - 0.5)) * np.cos(20 * (T - 0.5))) + 0.002 * RNG.normal(size=N)
@@ -129,3 +130,24 @@ def test_an_honest_position_is_left_alone(x, tmp_path):
     assert got.t.size == N
     assert got.notes == ()
     assert_allclose(got.y[0], x, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.00227])
+def test_a_scaled_counter_is_unwrapped(scale):
+    """A counter of 16 bits is continued where it wraps, whatever a count is worth."""
+    counts = np.array(64_000 + np.round(3000 * T), dtype=np.float64)
+    read = {"x1": np.array(scale * (counts % 65_536), dtype=np.float64)}
+    done, _, notes = repair_positions(T, read, None, unit="cm", scales={"x1": scale}, wanted={})
+    assert_allclose(done["x1"] - done["x1"][0], scale * (counts - counts[0]))
+    assert list(facts(notes)) == ["unwrap"]
+
+
+@pytest.mark.parametrize("size", [9000.0, -9000.0])
+def test_a_new_zero_of_a_moving_cart_leaves_no_step(size):
+    """Where a jump was removed, the cart moves on as in the samples beside it."""
+    x = np.array(np.round(4000 * T) + np.where(np.arange(N) >= 700, size, 0.0), dtype=np.float64)
+    done, _, notes = repair_positions(
+        T, {"x1": x}, None, unit="count", scales={"x1": 1.0}, wanted={}
+    )
+    assert_allclose(done["x1"], np.round(4000 * T), atol=1.0)
+    assert list(facts(notes)) == ["jumps"]

@@ -10,14 +10,15 @@ import pytest
 from pipeline.arrays import Array
 from pipeline.identify.recording_checks import check_signs
 from pipeline.ingest.read import read_data
-from pipeline.ingest.sign import find_signs
+from pipeline.ingest.sign import find_signs, with_signs
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.simulate import simulate_linear
 from pipeline.report.sections.questions import ask
 from pipeline.results import Record
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.simulated.submission import write_submission
-from pipeline.submission import load_submission
+from pipeline.submission import Submission, load_submission
+from pipeline.submission.models import System
 from pipeline.workflow import analyse
 
 T = 0.0088542 * np.arange(900, dtype=np.float64)
@@ -46,6 +47,17 @@ def respond(preset: str, u: Array, sign: int) -> Array:
     y = simulate_linear(PRESETS[preset], T, sign * u)[0]
     y = y / np.ptp(y) + 0.001 * rng.standard_normal(y.size)
     return np.rint(440 * y)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_scale_of_an_input_has_the_sign_that_was_found(sign):
+    """`with_signs` turns the input round, and the sign of its scale tells that it did."""
+    u = np.where((T > 1) & (T < 4), 1.0, 0.0)
+    submission = Submission(version=1, system=System(carts=3))
+    (record,), _, _ = with_signs(one(u, respond("throne-3dof", u, sign)), submission)
+    assert np.sign(record.input_scale) == sign
+    assert record.u is not None
+    assert np.array_equal(record.u, sign * u)
 
 
 CASES = {

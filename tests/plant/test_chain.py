@@ -139,6 +139,16 @@ def test_frequency_response_matches_state_space(chain):
     assert_allclose(got / scale, expected / scale, atol=1e-10)
 
 
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_transfer_functions_are_the_frequency_response(preset):
+    """Numerator over denominator of each cart's transfer function is its frequency response."""
+    chain, omega = PRESETS[preset], np.array([0.5, 7.0, 20.0, 50.0])
+    for cart, G in enumerate(chain.frequency_response(omega), start=1):
+        numerator, denominator = chain.transfer_function(cart)
+        ratio = np.polyval(numerator, 1j * omega) / np.polyval(denominator, 1j * omega)
+        assert_allclose(ratio, G, rtol=1e-9)
+
+
 def test_the_response_at_an_undamped_pole_is_infinite():
     """The response is infinite only at an undamped pole, whatever the number of carts."""
     one = Chain(m=np.array([1.0]), c=np.array([0.0]), k=np.array([4.0, 0.0]))

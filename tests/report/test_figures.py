@@ -25,9 +25,14 @@ from pipeline.gap.residual import ResidualForce
 from pipeline.plant.chain import Chain
 from pipeline.report.builder import Page
 from pipeline.report.document import Table
-from pipeline.report.figures import CARTS, MEASURED, QUIET
+from pipeline.report.figures import CARTS, MEASURED, MODEL, QUIET
 from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
-from pipeline.report.figures.gap import force_figure, force_left_figure, timing_figure
+from pipeline.report.figures.gap import (
+    force_figure,
+    force_left_figure,
+    spectrum_figure,
+    timing_figure,
+)
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import (
     DigitTicks,
@@ -282,10 +287,53 @@ def test_a_dwell_shades_the_transient():
     record = next(r for r in analysis.records if r.id == "sine-10")
     with drawing():
         figure = sine_figure(points, record=record, position_unit="cm")
-    for ax in figure.axes:
+    for ax, point in zip(figure.axes, points, strict=True):
         (span,) = (patch for patch in ax.patches if isinstance(patch, Rectangle))
         box = span.get_extents().transformed(ax.transData.inverted())
         assert_allclose([box.x0, box.x1], [0.0, 4.0], atol=1e-9)
+        low, high = (data(line, "y") for line in ax.lines if line.get_color() == MODEL)
+        assert_allclose(high - low, 2 * point.amplitude)
+
+
+def test_the_extrema_of_a_decay_are_drawn_at_their_times():
+    """The diamonds in the figure of a decay are its extrema, in time from the release."""
+    analysis = make_analysis(2)
+    decay = replace(analysis.log_decrements[0], release=analysis.log_decrements[0].release + 0.25)
+    record = next(r for r in analysis.records if r.id == decay.experiment)
+    with drawing():
+        figure = decay_figure([decay], records=[record], position_unit="cm")
+    (extrema,) = marked(figure.axes[0], "D")
+    assert_allclose(data(extrema, "x"), decay.peak_t - decay.release)
+    assert_array_equal(data(extrema, "y"), decay.peak_y)
+
+
+@pytest.mark.parametrize("cart", [1, 2])
+def test_a_stiffening_spring_is_drawn_as_stiffening(cart):
+    """The extra force of spring 2 over its stretch is +a d³, whichever of its carts was seen."""
+    (found,) = make_gap("named", ("cubic_spring",)).effects
+    x = np.linspace(-1.0, 1.0, 601)
+    one, two = -0.2 * x, 0.8 * x  # positions of carts 1 and 2, so the stretch is x
+    own, beside = (one, [0 * x, two]) if cart == 1 else (two, [one, 0 * x])
+    pull = 0.5 * x**3 if cart == 1 else -0.5 * x**3
+    force = replace(
+        small_force(cart), measured=pull, model=pull, position=own, neighbours=np.array(beside)
+    )
+    shown = force_figure(replace(found, where={"spring": 2}), [force], units=("cm", "V"))
+    assert shown is not None
+    for marker in ("o", "."):
+        line = next(one for one in marked(shown.axes[0], marker) if np.size(one.get_xdata()))
+        assert_allclose(data(line, "y"), 0.5 * data(line, "x") ** 3, atol=1e-12)
+        assert data(line, "x").max() > 0.9
+
+
+def test_a_spectrum_grows_in_proportion_to_the_motion():
+    """Three times the motion gives a spectrum three times as high, at the same frequencies."""
+    (trace, *_) = make_gap("named").traces
+    thrice = replace(trace, **{k: 3 * getattr(trace, k) for k in ("measured", "baseline", "final")})
+    small, large = (spectrum_figure([one], position_unit="cm") for one in (trace, thrice))
+    for before, after in zip(small.axes[0].lines, large.axes[0].lines, strict=True):
+        assert_allclose(data(after, "x"), data(before, "x"))
+        assert_allclose(data(after, "y"), 3 * data(before, "y"))
 
 
 @given(st.integers(10, 3000), st.integers(0, 2**32 - 1))

@@ -1,19 +1,26 @@
 """Harmful models and flagged mistakes cost points, and points are rounded to a step."""
 
 import itertools
+from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
+from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
 
+from pipeline.grading.grade import Criterion, Flag
+from pipeline.grading.judge.award import award
+from pipeline.grading.judge.context import Judgement, Verdict
 from pipeline.grading.mistakes.state_model import (
     StateMatrices,
     compare_entries,
     model_harm,
     order_names,
 )
-from pipeline.grading.rubric import Late
+from pipeline.grading.rubric import Late, Rubric
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.tolerance import exact
 from pipeline.grading.total import late_deduction, to_step
 from pipeline.plant.chain import PRESETS
@@ -200,3 +207,83 @@ def test_half_a_step_is_rounded_in_the_students_favour():
     late = Late(percent_per_day=10.0)
     assert late_deduction(Fraction("17.5"), late=late, step=0.5, days_late=1.0) == Fraction("1.5")
     assert late_deduction(Fraction("17.5"), late=late, step=0.01, days_late=1.0) == Fraction("1.75")
+
+
+# -------------------------------------------------------------------- tables of awards
+
+
+def awarded(
+    checks: list[dict],
+    shares: list[str | None],
+    *,
+    flags: tuple[Flag, ...] = (),
+    costs: Mapping[str, object] = MappingProxyType({}),
+) -> tuple[Criterion, ...]:
+    """Return what `award` gives for criteria of two points each, with these shares."""
+    plain = load_rubric(Path("throne-2dof")).model_dump(mode="json") | {
+        "step": 0.5,
+        "flags": dict(costs),
+    }
+    asked = [{"id": f"c{i}", "points": 2, **check} for i, check in enumerate(checks)]
+    rubric = Rubric.model_validate(plain | {"criteria": asked})
+    judgements = {
+        one.id: Judgement.plain(
+            Verdict(share=None if share is None else Fraction(share), message="")
+        )
+        for one, share in zip(rubric.criteria, shares, strict=True)
+    }
+    return award(rubric.criteria, judgements, flags, rubric=rubric)
+
+
+@pytest.mark.parametrize(
+    ("check", "share", "outcome", "points"),
+    [
+        ("laws", "1", "pass", 2.0),
+        ("laws", "0.99", "pass", 2.0),
+        ("laws", "0.874", "partial", 1.5),
+        ("laws", "0.125", "partial", 0.5),
+        ("laws", "0.124", "fail", 0.0),
+        ("laws", None, "skip", 0.0),
+        ("required", "1", "pass", 2.0),
+        ("required", "0.99", "partial", 1.5),
+    ],
+)
+def test_the_award_of_each_share(check, share, outcome, points):
+    """Points are rounded to the step, and a missing required item is never rounded away."""
+    (found,) = awarded([{"check": check}], [share])
+    assert (found.outcome, found.points) == (outcome, points)
+
+
+@pytest.mark.parametrize(
+    ("first", "outcome"), [("1", "pass"), ("0.5", "pass"), ("0", "skip"), (None, "skip")]
+)
+def test_an_award_waits_for_the_criteria_it_requires(first, outcome):
+    """A criterion is judged if the one that it requires earned points, not if it was skipped."""
+    _, second = awarded([{"check": "laws"}, {"check": "laws", "requires": ["c0"]}], [first, "1"])
+    assert second.outcome == outcome
+
+
+@pytest.mark.parametrize(
+    ("most", "points"),
+    [((1.0, 1.0), 0.0), ((0.25, 0.75), 0.5), ((0.75, 0.25), 0.5), ((0.25, 0.5), 1.0)],
+)
+def test_the_flag_that_may_cost_most_limits_the_loss(most, points):
+    """If no mistake can be undone, the award is limited by the largest `most` of its flags."""
+    codes = ("final_off", "physically_impossible")
+    flags = tuple(
+        Flag(code=code, parameters=("omega_1",), message="", evidence={"table": "final"})
+        for code in codes
+    )
+    costs = {code: {"least": 0.0, "most": one} for code, one in zip(codes, most, strict=True)}
+    (found,) = awarded([{"check": "final"}], ["0"], flags=flags, costs=costs)
+    assert found.points == points
+
+
+@pytest.mark.parametrize(
+    ("days", "points"),
+    [(0.0, 0), (0.5, 0), (0.51, 1), (1.5, 1), (1.51, 2), (3.5, 3), (5.51, 5), (20.0, 5)],
+)
+def test_each_day_begun_after_the_grace_costs_its_share(days, points):
+    """The late deduction grows with each day begun after the grace, up to the largest one."""
+    late = Late(percent_per_day=10.0, grace_days=0.5, most_percent=50.0)
+    assert late_deduction(Fraction(10), late=late, step=0.25, days_late=days) == points
