@@ -55,6 +55,8 @@ def test_nothing_heavy_is_loaded_until_it_is_asked_for():
         pipeline.analyze  # noqa: B018
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("module", ["notebook", "report.make_report", "grading.batch.grade_class"])
 def test_the_compiled_simulator_is_loaded_only_for_a_simulation(module):
     """A report or a grade does not wait for the compiler of the simulator."""

@@ -14,6 +14,8 @@ def told(lines: list[str]) -> str:
     )
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_reports_solutions_and_grades_say_what_they_said():
     """Reports, a solution and a class with mistakes give the committed facts."""
     assert not (lines := moved(sample)), told(lines)

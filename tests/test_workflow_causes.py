@@ -117,6 +117,8 @@ def test_one_cart_without_its_spring_is_the_first_cause(tmp_path):
     assert f"springs = {toml_flags([True, True])}" in told
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_untied_carts_that_come_to_rest_have_a_spring(tmp_path):
     """If no linear carts fit, because of saturation, the steps still show a spring to a wall."""
     bench = prepare_bench(preset="throne-2dof", hide=["saturation"])
@@ -127,6 +129,8 @@ def test_untied_carts_that_come_to_rest_have_a_spring(tmp_path):
     assert analysis.lacks_springs
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_gap_of_carts_that_lack_a_spring_accuses_nothing(tmp_path):
     """Without a spring that the recordings show, the gap names it, and no effect."""
     analysis = stated(tmp_path / "lab", (0.0, 0.08, 0.05), "[false, true, false]")
@@ -163,6 +167,8 @@ def test_a_unit_wrong_by_a_power_of_ten_is_the_first_cause(tmp_path, scale):
     assert "unit" in first_step(analysis)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize(
     ("scale", "unit", "why"),
     [

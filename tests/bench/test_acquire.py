@@ -139,6 +139,8 @@ def test_the_whole_cycle_finds_the_hidden_effect(tmp_path):
 # ----------------------------------------------------------------- what goes wrong
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
     """With 1 % of the lines damaged in each way, good lines are kept and faults counted."""
     work = write_work(tmp_path, [sine("dwell", seconds=8)])
@@ -198,6 +200,8 @@ def test_a_run_that_passes_the_input_limit_is_stopped_at_once(tmp_path, real):
     assert not seen or offending >= seen[-1].ms
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, fast):
     """After `kill -9` the watchdog stops the motor, and the file lacks only the latest lines."""
     work, notes = write_work(tmp_path, [sine("dwell", seconds=10)]), Notes()

@@ -46,6 +46,8 @@ def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
     assert load_submission(work).experiments == ()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_second_session_in_a_folder_is_refused(tmp_path, real, fast):
     """A second session in the same folder is refused, and the message names the first process."""
     work = write_work(tmp_path / "work", [sine("dwell", seconds=6)])
@@ -68,6 +70,8 @@ class Late(Notes):
         super().readings(batch, anomalies)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_busy_computer_is_named_if_the_watchdog_acts(tmp_path):
     """If the computer is too busy to send a heartbeat, the message says so."""
     work = write_work(tmp_path, [sine("dwell", seconds=5)])

@@ -236,6 +236,8 @@ def test_a_motor_that_starts_while_a_person_holds_a_cart_is_stopped(tmp_path):
     assert partial in notes.remarks  # before the Enter key was pressed
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_bench_that_misbehaves_after_its_line_was_lost_is_stopped(tmp_path):
     """After a lost line is opened again, the bench is watched from its first answer on."""
 
@@ -252,6 +254,8 @@ def test_a_bench_that_misbehaves_after_its_line_was_lost_is_stopped(tmp_path):
     assert "rest, stopped: " in partial[-1]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("wrong", [resting, running])
 def test_an_exploration_ends_if_the_bench_misbehaves(tmp_path, wrong):
     """If the bench misbehaves, an exploration ends and chooses no other experiment."""
@@ -263,6 +267,8 @@ def test_an_exploration_ends_if_the_bench_misbehaves(tmp_path, wrong):
     assert_over(bench)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("wrong", [tried, resting, running, ended])
 def test_a_stock_bench_that_misbehaves_is_stopped(tmp_path, wrong):
     """A stock bench, which answers no query, is watched as well."""

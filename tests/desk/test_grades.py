@@ -628,6 +628,8 @@ def test_a_class_is_graded_again_from_the_desk(tmp_path, anonymous):
     assert (set(shown) == entry.keys()) is not anonymous
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
     """In an anonymous class no page, address or refusal shows a name; exports use pseudonyms."""
     grades = write_class(tmp_path / "g", anonymous=True)

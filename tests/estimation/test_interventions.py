@@ -94,6 +94,8 @@ def test_the_start_and_end_of_a_touch_are_found():
     np.testing.assert_allclose([end for *_, end in at], [h.end for _, h in hands], atol=TO)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize(
     "effect",
     [

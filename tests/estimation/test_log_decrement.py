@@ -392,6 +392,8 @@ def flags(seeds, *, d):
     return np.array(found)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_friction_is_found_only_if_there_is_some():
     """Dry friction is found in all of twenty decays with d = 0.01 cm, and in none without it."""
     assert not flags(20, d=0.0).any()
@@ -427,6 +429,8 @@ def test_the_standard_errors_are_about_right():
     assert spread[2] < 1.35
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("name", ["second_mode", "frequency_shift"])
 def test_the_standard_errors_of_a_law_are_about_right(name):
     """Over 40 noisy decays, the errors of a law's numbers are as large as their standard errors.

@@ -84,6 +84,8 @@ def test_carts_without_springs_get_no_release_and_no_step():
     assert [r.kind for r in plan.recordings] == ["decay"] * 4 + ["sweep"]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_stock_bench_gets_only_its_own_commands():
     """A stock bench gets only its own commands: a square wave as sweep, and its PID on cart 1."""
     (sweep,) = of_kind(propose_plan(bare(), bench=STOCK), "sweep")
@@ -202,6 +204,8 @@ def test_extending_twice_changes_nothing(extended):
     assert extend_plan(edited, submission) == edited
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_loop_comes_once_the_dwells_are_recorded():
     """A closed loop is planned only once the dwells are recorded."""
     before, after = recorded("two-cart", *FIRST), recorded("two-cart", *FIRST, "sine")

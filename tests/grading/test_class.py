@@ -75,6 +75,8 @@ def test_a_table_of_three_carts_without_a_gain_gives_no_carts():
     assert "physically_impossible" in [flag.code for flag in grade.flags]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize(("seed", "digits"), [pytest.param(11, 2, marks=LONG), (17, 3)])
 def test_a_model_from_coarse_numbers_is_not_flagged(seed, digits):
     """A state model computed from coarsely typed numbers is not flagged.
@@ -104,6 +106,8 @@ def test_the_flags_are_those_that_explain_a_table_best(seed, turn, slips):
     assert {flag.code for flag in team.grade().flags} == set(slips)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_gain_that_two_mistakes_explain_names_both():
     """If two mistakes explain a gain equally well, the flag names both.
 
@@ -144,6 +148,8 @@ def test_a_spring_that_the_rubric_lacks_flags_nobody():
     assert wrong_springs([(), ()]) == ""
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_decay_with_friction_is_not_flagged_as_a_wrong_logarithm(tmp_path):
     """If friction makes the decays' damping uncertain, no wrong logarithm is flagged.
 

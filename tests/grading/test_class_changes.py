@@ -147,6 +147,8 @@ def test_forgotten_lateness_gives_a_message(school, tmp_path):
     assert grade_late("0") == ()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
     """A submission whose folder was renamed keeps its row and its points by hand.
 

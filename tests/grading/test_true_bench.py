@@ -128,6 +128,8 @@ def test_a_bench_belongs_to_the_name_of_a_submission(tmp_path):
     assert lacking == ("x",)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_command_judges_by_the_key_and_names_who_is_missing(tmp_path):
     """`simulate` writes the key, `grade --key` uses it, and a later grading knows its path."""
     key, school = tmp_path / "key.json", tmp_path / "class"

@@ -71,6 +71,8 @@ def scaled(chain: Chain, factor: float) -> Chain:
     return replace(chain, m=factor * chain.m, c=factor * chain.c, k=factor * chain.k)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof", "throne-3dof"])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_day_with_another_amplifier_is_a_group(preset, seed):

@@ -46,6 +46,8 @@ def hand_in(folder: Path, *, hide: tuple[str, ...] = (), late: int = 0) -> Path:
     return folder
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_late_channel_is_reported_with_its_delay(tmp_path):
     """A late channel fails a check that gives its delay, and the recordings get a flag."""
     submission = load_submission(hand_in(tmp_path / "team", late=LATE))

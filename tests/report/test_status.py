@@ -64,6 +64,8 @@ def test_a_typed_number_is_off_beyond_its_rounding_and_the_error(share, off):
     assert list_off(GOOD.rows, typed) == (("omega_n",) if off else ())
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_terminal_exit_code_files_and_desk_agree(tmp_path):
     """A number typed in another unit shows in the last line, the exit code and every file."""
     folder = tmp_path / "lab"

@@ -105,6 +105,8 @@ def test_failed_checks_are_status_one(tmp_path):
     assert done.returncode == 1
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_unreadable_file_affects_only_its_run(tmp_path):
     """If one file is missing and one is broken, both are reported and everything else is computed.
 

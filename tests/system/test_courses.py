@@ -86,6 +86,8 @@ def fill_in(released: Path, handed_in: Path, answers: str) -> None:
     handed_in.write_text(json.dumps(notebook), encoding="utf-8")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_nbgrader_gives_a_point_per_right_number(recordings, run, tmp_path):
     """Nbgrader hides the solution and scores each number against the student's own recordings."""
     need("nbgrader")
@@ -118,6 +120,8 @@ def test_nbgrader_gives_a_point_per_right_number(recordings, run, tmp_path):
     ]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_otter_gives_a_point_per_right_number(recordings, run, tmp_path):
     """Otter hides the solution and scores each number of the zip that a notebook exports."""
     need("otter")

@@ -193,6 +193,8 @@ def test_commands_are_grouped_by_role(page, group, command):
     assert set(listed[MORE]) == set(COMMANDS) - {name for names in ROLES.values() for name in names}
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_every_file_of_a_work_folder_is_documented(tmp_path):
     """All that `fill`, `check` and `report` leave in a submission is named in the documentation."""
     folder = tmp_path / "one-cart"

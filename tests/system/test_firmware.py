@@ -97,6 +97,8 @@ TICKS = st.tuples(
 )
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @given(
     encoders=st.sampled_from([2, 3]),
     session=st.lists(st.tuples(BYTES, st.lists(TICKS, max_size=12)), max_size=8),

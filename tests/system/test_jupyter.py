@@ -73,6 +73,8 @@ def _status(url: str, **headers: str) -> int:
         return error.code
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_desk_opens_from_the_launcher_and_only_for_its_owner(lab, browser):
     """Files, set-up, report and zip work for the owner of the server; everyone else is refused."""
     process, url, token = lab

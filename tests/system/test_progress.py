@@ -85,6 +85,8 @@ def test_earlier_grades_do_not_count_as_speed():
     assert bar.tasks[0].time_remaining == pytest.approx(8.0, abs=1.0)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
 def test_a_terminal_shows_stage_and_time(at_terminal, tmp_path):
     """On a terminal a line shows the current stage and the time; it is removed at the end."""

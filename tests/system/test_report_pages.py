@@ -239,6 +239,8 @@ CUT = """() => Array.from(document.querySelectorAll('.wide:has(table)')).filter(
 TOP = "document.querySelector('main').getBoundingClientRect().top"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_pages_are_accessible_on_every_screen(made, show):
     """On every screen the checker axe finds no serious barrier.
 

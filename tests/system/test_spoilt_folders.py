@@ -195,6 +195,8 @@ def test_a_spoilt_submission_gives_a_result_or_one_line(command):
 LONG = [pytest.mark.slow, pytest.mark.sample]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize(
     ("carts", "every"),
     [(1, 1), (1, 2), *(pytest.param(*case, marks=LONG) for case in ((2, 1), (2, 2), (3, 2)))],

@@ -95,6 +95,8 @@ def test_a_class_is_graded_and_sharing_is_flagged(graded):
     assert seen == [0, 1, 2, 3, 4, 4]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_number_of_processes_changes_no_row(school, graded, tmp_path):
     """A class graded with one process gets the same rows as with two."""
     _, _, rows, _ = graded
@@ -207,6 +209,8 @@ def test_memory_is_limited(school, setup, tmp_path):
         assert again.status == "graded"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
     """A submission that takes too long gets a row that says so; a run with more time grades it."""
     _, hung = run([school / "team-0"], tmp_path, time_limit=0.01)
@@ -218,6 +222,8 @@ def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
     assert graded["team-0"][0].status == "graded"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_files_of_a_stopped_submission_name_its_authors(school, tmp_path):
     """If a submission is stopped, its authors are in every table, and no mark is shown.
 

@@ -143,6 +143,8 @@ def test_rounding_errors_in_a_model_are_not_errors():
     assert not any(entry.error for entry in compare_entries(space, models=[exactly], n=1))
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_springs_and_sign_come_from_the_rubric(other, honest):
     """Springs and sign come from the rubric, even if the submission states others."""
     change(other, "springs = [true, false]", "springs = [false, true]")

@@ -245,6 +245,8 @@ def test_one_period_too_many_is_flagged(carts, k):
     assert flags(miscounted(k)(student(carts), INITIAL)) == ["peak_count"]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_gains_from_the_peak_of_a_step_with_friction_are_flagged():
     """With friction, gains read at the peaks after an edge are recognised too."""
     assert flags(peak_of_step(student(2, hide=FRICTION), INITIAL)) == ["peak_for_steady_state"]

@@ -41,6 +41,8 @@ def changed(analysis: Analysis, *, ratio=lambda x: x, stretch: float = 1.0) -> A
     return replace(analysis, tables=tuple(tables))
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize(("carts", "hide"), [(1, ()), (2, ()), (3, ()), (2, ("coulomb_friction",))])
 def test_an_honest_table_gets_no_flag(carts, hide):
     """An honest table gets no flag, although half the swing differs slightly from a sine fit."""
