@@ -195,6 +195,8 @@ def test_an_analysis_shows_its_summary_and_its_table(lab):
     assert repr(lab).startswith(summary.split(",")[0])
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_example_notebook_runs(monkeypatch):
     """Every code cell of the example runs, in order, and displays its last value."""
     mpl.use("agg")

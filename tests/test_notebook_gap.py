@@ -32,6 +32,8 @@ def gap(tmp_path_factory) -> ExplainedGap:
     return explain(folder)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_effects_are_a_table(gap):
     """The table has one row for each parameter of an effect, in the order found, with its unit."""
     assert pipeline.explain is explain

@@ -28,6 +28,8 @@ from pipeline.words.progress import silent
 from pipeline.workflow import analyse
 from tests.helpers.honest_benches import draw_effect
 
+_LONG = (pytest.mark.slow, pytest.mark.sample)
+
 
 def bench_of(k: tuple[float, ...]) -> SimulatedBench:
     """Return a bench of two or three carts."""
@@ -95,7 +97,11 @@ def assert_springs_come_first(
     assert contradicted == {names[j] for j in wrong}
 
 
-@pytest.mark.parametrize(("k", "springs"), _QUICK, ids=str)
+@pytest.mark.parametrize(
+    ("k", "springs"),
+    [_QUICK[0], *(pytest.param(*one, marks=_LONG) for one in _QUICK[1:])],
+    ids=str,
+)
 def test_a_wrong_spring_is_the_first_cause(tmp_path, k, springs):
     """Springs too many or too few are named, with the right line, before their consequences."""
     assert_springs_come_first(tmp_path / "lab", k, springs)
@@ -190,7 +196,6 @@ def test_an_input_that_no_converter_gives_is_asked_about(tmp_path, preset, scale
     assert not why or say(why) in first_step(analysis)
 
 
-_LONG = (pytest.mark.slow, pytest.mark.sample)
 _ALL = "decay,step,sine,sweep,control"
 
 

@@ -102,6 +102,8 @@ def test_existing_recordings_are_skipped(tmp_path, fast):
     assert [e.id for e in load_submission(work).experiments] == ["a", "b"]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_stock_bench_is_driven_by_people(tmp_path):
     """On a stock bench a person holds the carts, and no watchdog guards the motor."""
     work = write_work(tmp_path, [sine("dwell", seconds=1, settle=0.3)], per_count=0.00227)

@@ -80,6 +80,8 @@ def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
     assert not (work / "raw").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_impossible_recording_is_skipped_with_a_reason(tmp_path):
     """A chirp on a stock bench, or an amplitude below one count, is skipped with a reason.
 
@@ -174,6 +176,8 @@ def test_every_cart_of_the_bench_is_watched(tmp_path, real):
     assert "cart 2" in outcome.partial
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path, real):
     """If the line is opened while carts swing, they are zeroed again once they are at rest."""
     notes, heard = Notes(), bytearray()

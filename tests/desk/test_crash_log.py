@@ -124,12 +124,12 @@ def test_the_next_desk_removes_the_files_of_a_killed_one(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("sent", "status", "told"),
     [
-        ("SIGINT", 0, "ends: SIGINT"),
+        pytest.param("SIGINT", 0, "ends: SIGINT", marks=LONG),
         pytest.param("SIGHUP", 0, "ends: SIGHUP", marks=LONG),
         pytest.param("SIGKILL", -9, "", marks=LONG),
         ("SIGSEGV", -11, ""),
         pytest.param("memory MainThread", 1, "ends: MemoryError", marks=LONG),
-        ("memory server", 2, "server stopped"),
+        pytest.param("memory server", 2, "server stopped", marks=LONG),
         pytest.param("exit0 server", 2, "server stopped", marks=LONG),
         pytest.param("exit now", 3, "", marks=LONG),
     ],

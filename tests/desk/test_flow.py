@@ -79,6 +79,8 @@ def test_a_body_that_stops_arriving_is_refused():
     asyncio.run(run())
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_desk_itself_reads_nothing_that_a_student_wrote(tmp_path, monkeypatch):
     """No page of a student makes the desk's own process parse a file of the submission."""
     folder = a_submission(tmp_path / "team")

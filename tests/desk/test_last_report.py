@@ -26,6 +26,8 @@ def test_a_report_of_the_command_line_is_current_at_the_desk(options, tmp_path, 
     assert find_state(folder) == "older"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("face", ["desk", "command line"])
 def test_the_faces_replace_each_others_reports(face, tmp_path):
     """A report is up to date if it is newer than its sources, whichever face made the last one."""

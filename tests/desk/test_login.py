@@ -310,6 +310,8 @@ def test_each_role_has_its_pages(lab, path):
             assert lab(name).get(path).status in (200, 303, 405), name
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_opening_a_page_writes_nothing(lab, root):
     """A GET request for any page changes no file."""
 

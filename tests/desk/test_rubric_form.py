@@ -106,6 +106,8 @@ def test_a_new_rubric_does_not_replace_another_one(visitor, lab):
         assert lab.read_text(encoding="utf-8") == before
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_rubric_is_found_in_a_folder_of_any_name(visitor, tmp_path):
     """A rubric is found even if its folder's name has characters that are special in addresses.
 

@@ -272,6 +272,8 @@ def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
     assert ("report/report.pdf" in zipped(visitor).namelist()) == (change == "nothing")
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_content_of_the_zip_is_shown_before_handing_in(filled):
     """Before handing in, the page shows the zip's content, open questions and assumptions."""
     visitor, folder = filled

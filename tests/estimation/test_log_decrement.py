@@ -422,6 +422,8 @@ def standardised(seeds):
     return np.array(errors)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_standard_errors_are_about_right():
     """Over 60 noisy decays, actual errors are about as large as the standard errors."""
     spread = np.sqrt(np.mean(standardised(60) ** 2, axis=0))

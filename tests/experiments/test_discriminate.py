@@ -133,6 +133,8 @@ def test_another_dispute_gets_another_recording(proposed):
     assert with_proposal(disputed(DRY), limits=LIMITS).proposal is None
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_hopeless_contender_decides_nothing(proposed):
     """An explanation with almost no weight does not influence which recording is proposed."""
     gap = disputed(DRY, DRAG, STIFF)

@@ -269,6 +269,8 @@ def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
     assert "mine," in said[1]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_added_recording_comes_next_whatever_its_id(tmp_path):
     """A recording that a person adds comes next, even with the id of the program's own step."""
     bench = bench_of()

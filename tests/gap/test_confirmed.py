@@ -191,6 +191,8 @@ def test_only_a_motion_that_the_laws_give_is_followed():
     assert are_followed([(own, 0.9, 1.4)], unstable, records) == [False]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("calls", [0, 3, 6, 12, 1000])
 def test_an_answer_in_hand_is_kept_when_the_time_is_up(calls):
     """If the time is up while effects are confirmed, the model with all effects is the answer."""

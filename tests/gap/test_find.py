@@ -1,11 +1,15 @@
 """The search tries the right laws and hypotheses."""
 
+import pytest
+
 from pipeline.gap.judge import judge
 from pipeline.gap.search import find_hypotheses
 from tests.gap.begun import DELAY, begun
 from tests.truth.bench import Hidden
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_friction_below_the_noise_floor_is_not_named():
     """Friction that changes no error is no effect, if a delay alone leaves only noise."""
     fit, study = begun(

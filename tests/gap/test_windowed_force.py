@@ -122,6 +122,8 @@ def test_noise_has_no_formula():
     assert all(shown.formula is None for shown in residual.against)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_an_effect_that_the_catalogue_lacks_is_described():
     """If the catalogue lacks drag, drag is not named, but its formula is found."""
     catalogue = [effect for effect in CATALOGUE if effect.key != "quadratic_drag"]

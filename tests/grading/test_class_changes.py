@@ -83,6 +83,8 @@ def pages(out: Path) -> dict[str, bytes]:
     return {name: (out / name).read_bytes() for name in ("grades.csv", "class.html")}
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("loss", ["missing", "emptied", "another"])
 def test_feedback_without_its_gradebook_is_not_replaced(school, tmp_path, loss):
     """If the gradebook beside feedback is lost, grading is refused and nothing changes."""
@@ -102,6 +104,8 @@ def test_feedback_without_its_gradebook_is_not_replaced(school, tmp_path, loss):
     grade(school, out=out)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_late_submission_graded_alone_keeps_the_class(school, tmp_path):
     """A late submission graded alone gives the same class as grading all submissions together.
 
@@ -124,6 +128,8 @@ def test_a_late_submission_graded_alone_keeps_the_class(school, tmp_path):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_forgotten_lateness_gives_a_message(school, tmp_path):
     """If a late submission is graded again without the table of days late, a message says so.
 
@@ -225,6 +231,8 @@ def test_a_rubric_of_another_name_is_refused(school, tmp_path):
     assert rows(out)["team-1"]["by_hand"] == "pieces"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_corrected_id_in_another_folder_flags_nobody(school, tmp_path):
     """The platform's number identifies a submission even if its id and folder have changed.
 

@@ -176,6 +176,8 @@ def test_a_submission_gets_the_points_of_cartlab_grade(shown, team, tmp_path):
     assert "final_off" in results["extra_data"]["flags"]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("form", ["one folder", "zip in the folder", "loose files"])
 def test_all_ways_to_upload_have_the_same_result(root, team, shown, tmp_path, form):
     """A folder, an archive and loose files (without their folders) all give the same result."""
@@ -290,6 +292,8 @@ def test_a_grader_that_is_killed_leaves_a_result(root, team):
     assert "submit again" in results["output"]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_grading_that_takes_too_long_is_stopped(root, team, monkeypatch):
     """If grading takes longer than cartlab's time limit, the result says so.
 

@@ -67,6 +67,8 @@ def test_an_honest_team_keeps_its_points(friction):
     assert final.expected["K"] == pytest.approx(bench.parameters["K"])
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_recordings_of_another_bench_do_not_count(friction):
     """Recordings and numbers of a neighbour count as not handed in, and are wrong."""
     submission, own = friction

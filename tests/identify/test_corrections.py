@@ -146,6 +146,8 @@ def test_a_record_in_another_unit_is_wrong_and_not_only_odd():
     assert found == [("step-2", "other_unit", "wrong")]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_reversed_channel_is_wrong_and_its_gain_not_only_odd():
     """A reversed channel says why one static gain is odd, so this reason is given."""
     first, second, third, fourth = steps(3.0, 4.0, 5.2, 6.8)  # too different to be repeats

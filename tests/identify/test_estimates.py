@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
@@ -33,6 +34,8 @@ def test_gain_intervals_of_a_sticking_cart_may_be_disjoint():
     assert [(check.outcome, check.code) for check in checks] == [("fail", "sticks")] * 2
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_step_that_friction_stops_short_does_not_pass(tmp_path):
     """If friction stops a cart short at every edge, the step does not pass the check.
 

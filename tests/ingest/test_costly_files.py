@@ -53,6 +53,8 @@ def with_many_names(file: h5py.File) -> None:
         file[f"s{i}"] = group
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("fill", [inflating, with_many_names])
 @pytest.mark.parametrize("apart", [False, True])
 def test_a_bomb_costs_its_recording(fill, apart, tmp_path):

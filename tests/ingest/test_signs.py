@@ -134,6 +134,8 @@ def reversed_in(records: Sequence[Record], names: Collection[str]) -> list[Recor
     return [replace(r, u=-r.u) if r.u is not None and r.id in names else r for r in records]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_late_input_does_not_turn_the_sign_of_dwells(bench, sign):
     """With a late input a fast dwell may seem reversed, but every record gets the right sign."""

@@ -146,6 +146,8 @@ def in_octave(models: dict[str, AugmentedChain], runs: str, folder: Path) -> dic
     return found
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @no_octave
 @no_compiler
 def test_octave_moves_as_c_does_with_every_effect(tmp_path):

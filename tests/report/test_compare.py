@@ -142,6 +142,8 @@ def test_other_units_or_carts_are_refused_before_the_analysis(tmp_path, monkeypa
     assert not out.exists()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_compare_prints_a_change_in_one_line_on_stderr(tmp_path):
     """With `--compare` a changed gain is reported on the page and in one line on stderr."""
     earlier = json.loads(json_text(analysed("one-cart")))

@@ -415,6 +415,7 @@ def test_the_report_imports_only_what_it_needs():
     assert done.stdout.strip() == "[]"
 
 
+_LONGER = [pytest.mark.slow, pytest.mark.sample]
 _TOUCH = 2.0  # points by which two boxes may overlap, since letters do not fill their boxes
 
 
@@ -503,7 +504,9 @@ def tick_labels_out_of_view(figure: Figure) -> list[Text]:
     return unseen
 
 
-@pytest.mark.parametrize("carts", [1, 2, 3])
+@pytest.mark.parametrize(
+    "carts", [1, pytest.param(2, marks=_LONGER), pytest.param(3, marks=_LONGER)]
+)
 def test_no_text_of_a_figure_is_cut_or_covered(carts):
     """All text in a figure lies on the canvas, and no two texts overlap."""
     with drawing():

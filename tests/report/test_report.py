@@ -146,6 +146,8 @@ def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
     assert len(re.findall(r"row-\d\d", first + "".join(others))) == rows
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_print_is_shorter_than_the_page(folders):
     """The page has every check, dwell and change of a draft; the PDF has a line a kind of check."""
     analysis = make_analysis(3)
@@ -216,6 +218,8 @@ def test_the_page_is_accessible(folders):
     assert ("html", {"lang": "en"}) in page.tags
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_report_without_a_title_uses_its_subject_once():
     """If a report has no title, its subject becomes the title and is not repeated."""
     analysis = make_analysis(2)

@@ -146,6 +146,8 @@ def way_back(springs) -> list[Any]:
     return [*steps, *derivation.carts_alone(n), *derivation.redundancies(n)] if n > 1 else steps
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_each_printed_step_is_true(truth):
     """Each printed step from Newton's laws to the transfer functions and back is an identity."""
     springs, chain = truth

@@ -86,6 +86,8 @@ def test_a_step_gives_the_static_gain(fast_bench):
     np.testing.assert_allclose(gain, expected, rtol=1e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("hide", [[], ["force_offset"]])
 def test_a_run_does_not_depend_on_the_ticks_before_it(hide):
     """After a pause of any length, a released cart gives the same counts, tremor and noise."""

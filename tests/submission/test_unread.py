@@ -368,6 +368,8 @@ def test_a_wrong_name_is_said_where_its_number_is_missing(judged, old, new, said
     assert said in missing.message
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_one_typo_costs_one_number_in_grading(tmp_path):
     """With one decimal comma, the criterion says so; everything else is graded as before.
 

@@ -40,6 +40,8 @@ def test_what_is_left_out_is_counted():
     assert lines[-1] == f"- {left} more: see the page"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_many_files_that_cannot_be_read_do_not_fill_the_terminal(tmp_path):
     """The terminal shows some of the files; all are on the page."""
     folder = tmp_path / "one-cart"

@@ -170,6 +170,8 @@ def test_a_damping_at_its_bound_is_reported_as_unknown(tmp_path):
     assert found["chain"]["c"] == [0.0]
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_report_accepts_a_simulated_submission(tmp_path):
     """`report` reads a simulated submission, with its reported values, without any complaint."""
     folder = tmp_path / "bench"

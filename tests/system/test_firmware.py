@@ -332,6 +332,8 @@ def test_the_answer_to_a_query_is_a_description(library):
     assert parse_description(core.take()) == _description()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_noise_breaks_nothing(tmp_path):
     """Half a million ticks of noise, extreme gains and jumping clocks corrupt no memory."""
     sanitize = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")

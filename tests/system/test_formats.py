@@ -41,6 +41,8 @@ def teams(tmp_path_factory) -> Path:
     return root
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_results_have_the_same_numbers(teams):
     """CSV, Excel and TDMS files of the same recordings give equal parameters and checks."""
     told = {}

@@ -490,6 +490,8 @@ def test_all_open_pages_show_the_same(page, show):
     expect(first.locator("#ask")).to_be_hidden()
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
 def test_the_live_page_is_accessible(page, show, size):
     """The live page is accessible (axe) by day and night, and nothing is wider than the screen."""

@@ -134,6 +134,8 @@ def show(browser, window):
 # ------------------------------------------------------------------------ as files
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_the_page_is_valid_html(made):
     """A strict parser finds no fault in the HTML, every id is unique, and the file is small."""
     html = page_of(made).read_text(encoding="utf-8")

@@ -145,6 +145,8 @@ def try_seed(name: str, seed: int) -> None:
             use(name, path)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("name", NAMES)
 def test_a_spoilt_file_gives_a_result_or_a_short_error(name):
     """For 30 random faults in each kind of file, there is a result or a short error."""

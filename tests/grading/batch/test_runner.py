@@ -325,6 +325,8 @@ def test_another_version_of_numpy_grades_everything_again(monkeypatch):
             assert code_version() != before
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_handed_out_recording_is_not_flagged(school, tmp_path):
     """A recording that was handed out to everybody is not flagged in two submissions."""
     records = read_data(load_submission(school / "team-0")).records

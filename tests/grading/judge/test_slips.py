@@ -468,6 +468,8 @@ def rounded(table: Mapping[str, Any], digits: int) -> dict[str, Decimal]:
     return {name: Decimal(f"{float(value):.{digits - 1}e}") for name, value in table.items()}
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize(("carts", "hide"), [(1, ()), (2, ()), (3, ()), (2, FRICTION)])
 def test_an_honest_student_gets_no_flag(carts, hide):
     """Students who round, make small errors, guess dampings or have a sticking cart are honest.

@@ -308,6 +308,8 @@ def test_contradicting_dwells_and_steps_identify_nothing(session):
     assert initial == {"omega_1", "omega_2", "zeta_1", "zeta_2"}
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_recording_of_no_linear_carts_is_left_out_but_not_called_wrong(session):
     """A recording that linear carts cannot produce is left out, but not called wrong."""
 

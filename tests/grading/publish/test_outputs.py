@@ -313,6 +313,8 @@ def test_feedback_says_why_a_submission_was_not_graded():
     assert "given by hand" in told
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_feedback_lists_every_mistake_of_a_broken_submission(tmp_path):
     """If a submission's file has three mistakes, the feedback lists them in three lines.
 

@@ -101,6 +101,8 @@ def test_a_team_without_stored_findings_is_named(tmp_path):
     assert sorted(shown.unknown) == sorted(graded)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_team_graded_by_another_rubric_is_named(school, tmp_path):
     """If a team was graded by another rubric, the preview names the team and shows no points."""
     plain = RUBRIC.model_dump(mode="json")

@@ -11,7 +11,9 @@ from pipeline.grading.self_check.check import JudgedNumbers, judge_numbers, next
 from tests.helpers.grading_class import Team, make_team
 from tests.helpers.grading_slips import OF_SEVERAL_CARTS, SLIPS, reporting, scaled
 
-SEEDS = range(3)  # one bench each with one, two and three carts
+# One bench each with one, two and three carts.
+LONG = [pytest.mark.slow, pytest.mark.sample]
+SEEDS = [0, *(pytest.param(seed, marks=LONG) for seed in (1, 2))]
 NOT_PLACED = {  # seeds for which no number disagrees with the recordings
     "initial_final_disagree",
     "missing",
@@ -91,11 +93,13 @@ def test_honest_numbers_agree(seed):
     assert next_answer(found, (), basis="0").stage == "which"
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("slip", sorted(SLIPS.keys() - NOT_PLACED))
 def test_most_common_mistakes_are_recognised(slip):
     """At the second run, the check names the right mistake for most of the wrong numbers."""
     placed = []
-    for seed in SEEDS:
+    for seed in range(3):
         one, found = judged(slip, seed)
         if one is team(seed) or not found.disagree:
             continue

@@ -95,6 +95,8 @@ def of_kind(records, kind):
     return next(record for record in records if record.kind == kind)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_honest_teams_on_one_bench_share_nothing(teams):
     """Teams that drive one bench with the same inputs are not flagged, as their noise differs."""
     assert find_copies(class_of(teams)) == {}
@@ -116,6 +118,8 @@ def test_agreement_by_rounding_is_not_flagged(quiet_teams, per_cm):
         assert set(find_copies([*batch, prints("copy", copied)])) == {"0", "copy"}
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize("per_cm", [5, pytest.param(20, marks=LONG)])
 def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
     """Honest teams with coarse encoders are not flagged, even if a cart moves by one or two counts.
@@ -182,6 +186,8 @@ WHOLE = {
 }
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 @pytest.mark.parametrize(
     "disguise",
     [
@@ -294,6 +300,8 @@ def compared(monkeypatch):
     return pairs
 
 
+@pytest.mark.slow
+@pytest.mark.sample
 def test_a_recording_under_many_names_is_compared_once(teams, compared):
     """A file that two submissions list under a thousand names is compared only once."""
     record = of_kind(teams[0], "decay")
