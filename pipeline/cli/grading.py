@@ -233,22 +233,30 @@ def adjust(
 @app.command()
 def hold(
     grades: Grades,
-    team: Team,
     by: Annotated[str, typer.Option(metavar="NAME", help="Who decides.")],
+    team: Annotated[
+        str, typer.Argument(metavar="[TEAM]", help="A submission, or one of its authors.")
+    ] = "",
+    criterion: Annotated[
+        str, typer.Option(metavar="ID", help="A criterion, for the whole class.")
+    ] = "",
     why: Annotated[str, typer.Option(help="The reason, for the staff.")] = "",
     end: Annotated[bool, typer.Option("--end", help="Hold it back no longer.")] = False,
     assignment: Lab = None,
 ) -> None:
-    """Hold a team's grade back from students and exports; or, with --end, no longer."""
+    """Hold a team's grade, or a criterion, back from students; or, with --end, no longer."""
     from pipeline.grading.publish.pseudonyms import resolve_pseudonym
 
+    if bool(team) == bool(criterion):
+        raise typer.BadParameter("name either a team or a --criterion")
     with _changing(grades, assignment) as book:
-        name = resolve_pseudonym(book, team)
-        if end:
-            book.let_go(name, by=by)
+        if criterion:
+            book.hold_criterion(criterion, not end, why=why, by=by)
+        elif end:
+            book.let_go(resolve_pseudonym(book, team), by=by)
         else:
-            book.hold(name, why=why, by=by)
-    say(f"{team}: {'no longer ' if end else ''}held back")
+            book.hold(resolve_pseudonym(book, team), why=why, by=by)
+    say(f"{team or criterion}: {'no longer ' if end else ''}held back")
 
 
 def _change(

@@ -180,6 +180,7 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/grades/{n:nth}/clean", "GET", class_page.show_clean),
     ("/grades/{n:nth}/clean", "POST", class_page.accept),
     ("/grades/{n:nth}/release", "POST", class_page.release),
+    ("/grades/{n:nth}/hold", "POST", class_page.hold_criterion),
     ("/feedback/{n:nth}/", "GET", my_feedback.show),
     ("/feedback/{n:nth}/whole", "GET", my_feedback.show_whole),
     ("/feedback/{n:nth}/ask", "POST", my_feedback.send),

@@ -1,7 +1,7 @@
 """The rubric: required items, criteria with points and tolerances, late policy."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from datetime import datetime
 from decimal import Decimal
 from fnmatch import fnmatchcase
@@ -381,6 +381,11 @@ class Rubric(TomlTable):
     def titles(self) -> dict[str, str]:
         """The titles of the criteria, by id; a criterion without a title is called by its id."""
         return {asked.id: asked.title or asked.id for asked in self.criteria}
+
+    def without(self, held: Container[str]) -> "Rubric":
+        """Return the rubric without some criteria."""
+        criteria = tuple(asked for asked in self.criteria if asked.id not in held)
+        return self.model_copy(update={"criteria": criteria})
 
     def criterion(self, id_: str) -> Criterion | None:
         """Return the criterion with this id, or None."""

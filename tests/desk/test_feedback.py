@@ -100,6 +100,34 @@ def fields(answer: Answer, at: int = 0) -> dict[str, str]:
 # ------------------------------------------------------------------------- who reads what
 
 
+def test_a_criterion_is_held_back_from_all_students(released, book):
+    """Any TA holds it back; students see that, and nothing of it; only an instructor ends it.
+
+    A request that was sent before is hidden with its answer, and a new one is refused.
+    """
+    student, ta = released("s4"), released("Ada")
+    ask(student)
+    laws = next(one for one in book.rubric.criteria if one.id == "laws")
+    before = student.get(HERE)
+    assert 'id="criterion-laws"' in before.text
+    assert before.state["held"] == "0"
+    assert ta.post(ROOM + "hold", do="hold", criterion="laws", why="").status == 422
+    assert ta.post(ROOM + "hold", do="hold", criterion="laws", why="second marker").status == 303
+    assert 'id="held-criteria"' in ta.get(ROOM).text
+    for page in (student.get(HERE), student.get(HERE + "whole")):
+        assert "second marker" not in page.text
+        assert "see page 3" not in page.text
+        assert f"of {20 - laws.points:g}" in page.text
+    shown = student.get(HERE)
+    assert 'id="criterion-laws"' not in shown.text
+    assert (shown.state["held"], shown.state["waiting"]) == ("1", "0")
+    assert ask(student).status == 422
+    assert ta.post(ROOM + "export", lms="canvas").status == 422
+    for who, status in ((student, 403), (ta, 403), (released("prof"), 303)):
+        assert who.post(ROOM + "hold", do="let_go", criterion="laws").status == status
+    assert student.get(HERE).state == before.state
+
+
 def test_students_see_nothing_before_the_release(lab):
     """Students see no feedback before it is released; only an instructor can release or hide it."""
     student = lab("s4")

@@ -109,6 +109,7 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
         n_requests=ask.gradebook.n_waiting(),
         released=ask.gradebook.released,
         may_release=may_release(ask),
+        held_criteria=ask.gradebook.held_criteria,
         platforms=PLATFORMS.values(),
     )
 
@@ -242,6 +243,7 @@ def show_class_page(ask: PageRequest) -> Response:
 def show_feedback(ask: PageRequest) -> Response:
     """Show the feedback that a team reads, in its current state."""
     team = ask.class_view.team(ask.request.path_params["name"])
+    team = team.without(ask.gradebook.held_criteria)
     figures, name = ask.gradebook.figures(team), team.grade.submission
     return show_own_page(feedback_page(view(team, "staff"), figures=figures, name=name))
 
@@ -297,6 +299,16 @@ def release(ask: PageRequest) -> Response:
     if held:
         message += f" {count(len(held), 'team')} with shared recordings held back: review them."
     return ask.back(f"{ask.here}#work", message)
+
+
+def hold_criterion(ask: PageRequest) -> Response:
+    """Hold a criterion back for the whole class, or no longer."""
+    criterion, held = ask.text("criterion"), ask.text("do") == "hold"
+    if not held and not may_release(ask):
+        raise HTTPException(403, "only the instructor decides when students can read a criterion")
+    ask.gradebook.hold_criterion(criterion, held, why=ask.text("why"), by=ask.sign())
+    title = capital(ask.class_view.rubric.titles[criterion])
+    return ask.back(f"{ask.here}#work", f"{title}: {'' if held else 'no longer '}held back.")
 
 
 def export_class(ask: PageRequest) -> Response:

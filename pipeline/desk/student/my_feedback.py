@@ -19,7 +19,7 @@ from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.publish.feedback import TONES, feedback_page, sentence
 from pipeline.grading.publish.view import GradeView, view
 from pipeline.grading.rubric import Criterion as Asked
-from pipeline.grading.words import WORDS, person_lines, points_text, waiting_text
+from pipeline.grading.words import WORDS, points_text, waiting_text
 from pipeline.report.document import paragraph
 from pipeline.report.html import render_blocks
 from pipeline.words.numbers import NOTHING
@@ -145,7 +145,7 @@ def _show_page(
         lost=[one for one in criteria if one["lost"]],
         kept=[one for one in criteria if not one["lost"] and one["id"] not in grade.open],
         waiting=[one for one in criteria if not one["lost"] and one["id"] in grade.open],
-        by_person=person_lines(grade),
+        by_person=seen.person_lines(),
         hidden=seen.hides_numbers,
     )
     return ask.page("feedback", status=status, title=found.rubric.title or "Feedback", page=page)

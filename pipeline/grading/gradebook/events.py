@@ -4,14 +4,15 @@ Nothing else is stored of what people do. The grade, the requests and the review
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 from pipeline.grading.grade import Adjustment, Criterion, Grade, GradeOverride
 from pipeline.grading.gradings import same_people
-from pipeline.grading.rubric import Rubric
+from pipeline.grading.rubric import Criterion as Asked
+from pipeline.grading.rubric import Rubric, find_remarks
 from pipeline.grading.total import with_total
 
 # The place of an adjustment in the gradebook. No criterion can have this id. All adjustments count;
@@ -31,7 +32,8 @@ class Event:
     negative. `asked`, `answered` and `reopened` belong to a student's request to review a
     criterion. `reviewed` marks a grading as reviewed, and `unreviewed` takes the mark back.
     `held` holds the grade of one submission back from students and exports, and `let_go` ends
-    this. `released` lets students read the feedback of the class, and `hidden` hides it.
+    this; without a submission, they are about a criterion of the whole class. `released` lets
+    students read the feedback of the class, and `hidden` hides it.
 
     The history also has events of the grader. `graded` is a grading by the rubric alone. `listed`
     is a new or changed line of a class list, with shared data and points by hand. `removed` is the
@@ -196,6 +198,7 @@ class Entry:
     key : hash of everything that affects the grade.
     grading : number of the grading in the gradebook.
     first_key : key of the first version under this name; strangers cannot guess it.
+    held : criteria that are held back, so neither the rubric nor the grade has them.
     """
 
     submission: str
@@ -207,6 +210,7 @@ class Entry:
     key: str
     grading: int
     first_key: str
+    held: tuple[Asked, ...] = ()
 
     @cached_property
     def grade(self) -> Grade:
@@ -270,6 +274,30 @@ class Entry:
         """Name of the person who marked the grading as reviewed, or ""."""
         marks = [event for event in self.events if event.grading == self.grading]
         return marks[-1].by if marks and marks[-1].what == "reviewed" else ""
+
+    def without(self, held: Container[str]) -> "Entry":
+        """Return the entry as if the rubric did not have the criteria that are held back.
+
+        The total, the deduction for lateness, flags, points by hand and requests are those of the
+        other criteria. So nothing in it depends on the points of these.
+        """
+        back = tuple(asked for asked in self.rubric.criteria if asked.id in held)
+        if not back:
+            return self
+        rubric = self.rubric.without(held)
+        flags = [flag for asked in back for flag in find_remarks(self.graded, asked, self.rubric)]
+        left = {"flags": tuple(f for f in self.graded.flags if f not in flags), "notes": ()}
+        return replace(
+            self,
+            rubric=rubric,
+            graded=with_total(
+                self.graded.model_copy(update=left),
+                [own for own in self.graded.criteria if own.id not in held],
+                rubric=rubric,
+            ),
+            events=tuple(event for event in self.events if event.criterion not in held),
+            held=back,
+        )
 
     def changes(self, criterion: str) -> list[Event]:
         """Return all changes by hand of a criterion, oldest first."""

@@ -38,6 +38,7 @@ from pipeline.grading.gradebook.rows import (
     class_list,
     erase_rows,
     find_requests,
+    held_criteria,
     in_class,
     is_released,
     known_grading,
@@ -341,6 +342,11 @@ class Gradebook:
                 read = [(row, read_flag(row.shared)) for row in rows]
                 found = read_entries(connection, read, rubric=rubric)
             yield from found
+
+    def shown_entries(self) -> Iterator[Entry]:
+        """Yield the entries as students may read them, without criteria that are held back."""
+        held = self.held_criteria
+        return (entry.without(held) for entry in self.entries())
 
     def entry(self, team: str) -> Entry:
         """Return the class-list entry of the submission whose id or author is `team`.
@@ -723,6 +729,46 @@ class Gradebook:
 
         self._decide(team, decide, by=by)
 
+    @property
+    def held_criteria(self) -> tuple[str, ...]:
+        """The criteria of the rubric that are held back for the whole class."""
+        with self._database.reading() as connection:
+            last = self._last(connection)
+            held, titles = held_criteria(connection, last.assignment), read_rubric(last).titles
+        return tuple(criterion for criterion in held if criterion in titles)
+
+    def hold_criterion(self, criterion: str, held: bool, *, why: str = "", by: str) -> None:
+        """Hold a criterion back for the whole class, or no longer.
+
+        Students then read neither its points nor what follows from them, and no totals are
+        exported.
+
+        Raises
+        ------
+        ConfigError : the rubric has no such criterion or no other one to show, a reason or name is
+            missing, or the criterion already is in this state.
+        """
+        with self._database.changing() as connection:
+            last = self._last(connection)
+            now, titles = held_criteria(connection, last.assignment), read_rubric(last).titles
+            if criterion not in titles:
+                hint = nearest(criterion, [*titles])
+                raise ConfigError(f"{criterion}: the rubric has no such criterion{hint}")
+            if (criterion in now) == held:
+                raise ConfigError(f"{criterion}: is {'already' if held else 'not'} held back")
+            if held and (not why.strip() or not by.strip()):
+                raise ConfigError("give a reason and your name")
+            if held and titles.keys() <= {*now, criterion}:
+                raise ConfigError("no criterion would be left: do not publish the grades instead")
+            event = Event(
+                what="held" if held else "let_go",
+                criterion=criterion,
+                text=why.strip(),
+                by=by.strip(),
+                at=self._at(),
+            )
+            add_event(connection, event, assignment=last.assignment)
+
     def n_waiting(self) -> int:
         """Return the number of requests of the class that wait for an answer."""
         with self._database.reading() as connection:
@@ -750,7 +796,7 @@ class Gradebook:
     def own_feedback(self, submission: str, *, assignment: str = "") -> Entry | None:
         """Return what the authors of a submission may read; None until the feedback is released.
 
-        It is None too while the grade is held back.
+        It is None too while the grade is held back. Criteria that are held back are left out.
 
         Parameters
         ----------
@@ -766,7 +812,8 @@ class Gradebook:
             if not self._is_readable(connection, assignment):
                 return None
             entry = self._entry(connection, submission, exact=True)
-            return None if entry.hold else entry
+            held = held_criteria(connection, self._last(connection).assignment)
+            return None if entry.hold else entry.without(held)
 
     def ask(
         self, submission: str, criterion: str, *, why: str, by: str, assignment: str = ""
@@ -844,8 +891,11 @@ class Gradebook:
             if released is not None and not self._is_readable(connection, released):
                 raise RequestRefused("the feedback is not released to students")
             row, entry = self._found(connection, team, exact=released is not None)
-            if released is not None and entry.hold:
-                raise RequestRefused("the feedback is not released to students")
+            if released is not None:
+                if entry.hold:
+                    raise RequestRefused("the feedback is not released to students")
+                held = held_criteria(connection, self._last(connection).assignment)
+                entry = entry.without(held)
             return self._store(connection, row, decide(entry), by=by, at=self._at())
 
     def _store(

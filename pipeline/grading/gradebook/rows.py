@@ -25,7 +25,7 @@ from sqlalchemy import (
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, read_grade
 from pipeline.grading.gradebook.database import Database
-from pipeline.grading.gradebook.events import REQUESTS, Entry, Event
+from pipeline.grading.gradebook.events import HOLDS, REQUESTS, Entry, Event
 from pipeline.grading.gradebook.schema import (
     batches,
     drop_copied,
@@ -332,6 +332,17 @@ def is_released(connection: Connection, assignment: str) -> bool:
         events.c.assignment == assignment, events.c.what.in_(("released", "hidden"))
     )
     return connection.scalar(mine.order_by(events.c.id.desc()).limit(1)) == "released"
+
+
+def held_criteria(connection: Connection, assignment: str) -> tuple[str, ...]:
+    """Return the criteria of an assignment that are held back."""
+    mine = select(events.c.criterion, events.c.what).where(
+        events.c.assignment == assignment,
+        events.c.submission_id.is_(None),
+        events.c.what.in_(HOLDS),
+    )
+    last = {row.criterion: row.what for row in connection.execute(mine.order_by(events.c.id))}
+    return tuple(criterion for criterion, what in last.items() if what == "held")
 
 
 def add_event(

@@ -25,7 +25,7 @@ from pipeline.grading.publish.roster import (
 )
 from pipeline.grading.publish.view import GradeView, view
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.words import WORDS, on_one_line, person_lines, points_text, waiting_text
+from pipeline.grading.words import WORDS, on_one_line, points_text, waiting_text
 from pipeline.output import csv_text, named_folder, own_folder, write_file, zip_bytes
 from pipeline.words.text import with_symbols
 
@@ -57,12 +57,18 @@ def export(
 
     Raises
     ------
-    ConfigError : the roster is not a table of this platform, its maximum grade differs from the
-        rubric's, or `out` has the name of a file of another kind.
+    ConfigError : a criterion is held back, so there is no total yet; the roster is not a table of
+        this platform, its maximum grade differs from the rubric's, or `out` has the name of a file
+        of another kind.
     """
     table = out if out.suffix.lower() == ".csv" and not out.is_dir() else None
     folder = table.parent if table else named_folder(out)
     rubric = book.rubric
+    if held_back := book.held_criteria:
+        raise ConfigError(
+            f"{', '.join(held_back)}: held back, so there are no totals yet; first end this with "
+            "`cartlab hold --end`"
+        )
     title = title or rubric.title or "cartlab"
     entries, held = _without_held(book)
     students, remarks = students_of(entries, platform=platform)
@@ -110,7 +116,7 @@ def export(
 
 def _without_held(book: Gradebook) -> tuple[list[Entry], list[str]]:
     """Return the class list without grades that are held back, and the names of these."""
-    every = list(book.entries())
+    every = list(book.shown_entries())
     held = [entry.submission for entry in every if entry.hold]
     return [entry for entry in every if not entry.hold], held
 
@@ -208,7 +214,7 @@ def _comment_lines(view: GradeView) -> list[str]:
     if grade.awaits_grading:
         return [waiting_text(grade)]
     if grade.status == "failed" and not grade.criteria:
-        return [f"Could not be graded: {on_one_line(grade.reason)}", *person_lines(grade)]
+        return [f"Could not be graded: {on_one_line(grade.reason)}", *view.person_lines()]
     by_hand = {given.criterion for given in grade.overrides}
     lost = [
         f"{c.title or c.id}: {points_text(c.points)} of {points_text(c.out_of)}. "

@@ -9,9 +9,9 @@ from numbers import Real
 from typing import Any
 
 from pipeline import __version__
-from pipeline.grading.grade import Criterion, Flag, Grade, Outcome
+from pipeline.grading.grade import Criterion, Flag, Outcome
 from pipeline.grading.publish.view import GradeView
-from pipeline.grading.words import WORDS, person_lines, points_text
+from pipeline.grading.words import WORDS, points_text
 from pipeline.names import read_name
 from pipeline.report.document import (
     Block,
@@ -50,7 +50,8 @@ def feedback_page(view: GradeView, *, figures: Sequence[tuple[str, str]], name: 
 
     Parameters
     ----------
-    figures : pairs of file name and SVG text; left out if the view hides numbers.
+    figures : pairs of file name and SVG text; left out if the view hides numbers, or if a criterion
+        is held back.
     """
     grade, rubric = view.grade, view.rubric
     numbers = count(1)
@@ -60,7 +61,7 @@ def feedback_page(view: GradeView, *, figures: Sequence[tuple[str, str]], name: 
     if grade.criteria:
         blocks = tuple(_criteria(view, numbers))
         sections.append(Section("criteria", "Criteria, one by one", blocks))
-    if figures and not view.hides_numbers:
+    if figures and not (view.hides_numbers or view.held):
         blocks = tuple(_picture(i, *figure) for i, figure in enumerate(figures, start=1))
         sections.append(Section("figures", "Your recordings", blocks))
     document = Document(
@@ -79,6 +80,7 @@ def feedback_page(view: GradeView, *, figures: Sequence[tuple[str, str]], name: 
 def _summary(view: GradeView) -> list[Block]:
     grade, overrides = view.grade, view.grade.overrides
     points = f"{points_text(grade.points)} of {points_text(grade.out_of)}"
+    points += " so far" if view.held else ""
     by_hand = Tile(spans("Set by hand"), spans(counted_criteria(len(overrides))))
     if grade.status == "failed":
         key = "failed_by_hand" if overrides else "unsettled" if grade.unsettled else "failed"
@@ -91,7 +93,7 @@ def _summary(view: GradeView) -> list[Block]:
             why = paragraph(WORDS.spans(key, why=WORDS.text("failed_reasons")))
             blocks = [why, bullet_list(map(spans, (first, *others))), paragraph(then)]
         tiles = Tiles((tile, by_hand) if overrides else (tile,))
-        return [tiles, *_by_person(grade), *blocks, *_notes(view)]
+        return [tiles, *_by_person(view), *blocks, *_notes(view)]
     passed = sum(c.outcome == "pass" for c in grade.criteria)
     tiles = [
         Tile(spans("Points"), spans(points)),
@@ -114,12 +116,12 @@ def _summary(view: GradeView) -> list[Block]:
     if overrides:
         tiles.append(by_hand)
     hidden = [paragraph(_HIDDEN)] if view.hides_numbers else []
-    return [Tiles(tuple(tiles)), *_by_person(grade), *hidden, *_lost(view), *_notes(view)]
+    return [Tiles(tuple(tiles)), *_by_person(view), *hidden, *_lost(view), *_notes(view)]
 
 
-def _by_person(grade: Grade) -> list[Block]:
-    """Return the changes of the total with their reasons, and what a person still has to grade."""
-    return [paragraph(rich(sentence(line))) for line in person_lines(grade)]
+def _by_person(view: GradeView) -> list[Block]:
+    """Return the changes of the total with their reasons, and what is not in it yet."""
+    return [paragraph(rich(sentence(line))) for line in view.person_lines()]
 
 
 def counted_days(days: float) -> str:
@@ -206,6 +208,7 @@ def _criteria(view: GradeView, numbers: count) -> list[Block]:
         ]
         for c in grade.criteria
     ]
+    rows += [[clean(title), NOTHING, cell("held back", "quiet")] for title in view.held]
     head = WORDS.cells("points_head")
     blocks: list[Block] = [make_table(next(numbers), WORDS.text("points"), head, rows, "lrl")]
     for criterion in grade.criteria:

@@ -47,14 +47,15 @@ def write_outputs(
 
     Returns the people who are authors of several submissions. If the rubric is `anonymous`, all
     names are left out, and `anonymous-key.csv` has them. Feedback of submissions that are no longer
-    in the class is removed, and so is that of a grade that is held back; other files stay.
+    in the class is removed, and so is that of a grade that is held back; other files stay. No file
+    has a criterion that is held back.
     """
-    rubric = book.rubric
+    rubric = book.rubric.without(book.held_criteria)
     names = _names(book, out) if rubric.anonymous else None
     folder = own_folder(out, FEEDBACK)
     folder.mkdir(parents=True, exist_ok=True)
     made_of = _read_made(folder)
-    layout = _digest_layout(rubric)
+    layout = _digest_layout(rubric, book.held_criteria)
     grades: list[Grade] = []
     held: set[str] = set()
     now_of: dict[str, str] = {}
@@ -62,7 +63,7 @@ def write_outputs(
     authors: dict[str, tuple[str, ...]] = {}
     shared: dict[str, Flag] = {}
     numbers: dict[str, dict[Quantity, float]] = {}
-    for entry in book.entries():
+    for entry in book.shown_entries():
         shared |= dict(
             (entry.submission, flag) for flag in entry.grade.flags if flag.code == "shared_data"
         )
@@ -209,11 +210,11 @@ def _names(book: Gradebook, out: Path) -> dict[str, str]:
     return names
 
 
-def _digest_layout(rubric: Rubric) -> str:
+def _digest_layout(rubric: Rubric, held: Sequence[str]) -> str:
     """Return a hash of everything that affects all pages, such as templates and the rubric."""
     names = ("report.html.j2", "blocks.html.j2", "report.css", "page.js")
     parts = [(TEMPLATES / name).read_text(encoding="utf-8") for name in names]
-    return _digest(*parts, rubric.model_dump_json())
+    return _digest(*parts, rubric.model_dump_json(), *held)
 
 
 def _digest(*parts: str) -> str:

@@ -6,7 +6,7 @@ person wrote, but no computed number.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from pipeline.grading.grade import Code, Criterion, Flag, Grade
@@ -15,6 +15,7 @@ from pipeline.grading.publish.pseudonyms import anonymise
 from pipeline.grading.rubric import Rubric, find_remarks
 from pipeline.grading.similarity.shared_flag import student_message
 from pipeline.grading.words import WORDS, person_lines, points_text
+from pipeline.words.numbers import listing
 from pipeline.words.text import with_symbols
 
 Audience = Literal["team", "staff"]
@@ -31,12 +32,14 @@ class GradeView:
     grade : the grade, with the names that the audience may read.
     hides_numbers : whether to leave out all computed numbers.
     comments : what a person wrote about a criterion without giving points, by criterion.
+    held : titles of the criteria that are held back; the rubric and the grade do not have them.
     """
 
     grade: Grade
     rubric: Rubric
     hides_numbers: bool = False
     comments: Mapping[str, str] = field(default_factory=dict)
+    held: tuple[str, ...] = ()
 
     @property
     def is_by_hand(self) -> bool:
@@ -75,7 +78,12 @@ class GradeView:
         """Return the sentences about the total: lateness, adjustments, and what is not final."""
         off = self.grade.deducted
         late = [f"Late: {points_text(off)} points off."] if off else []
-        return [*late, *person_lines(self.grade)]
+        return [*late, *self.person_lines()]
+
+    def person_lines(self) -> list[str]:
+        """Return what people changed, have yet to grade, and hold back."""
+        back = [f"Held back, so not in these points: {listing(self.held)}."] if self.held else []
+        return [*person_lines(self.grade), *back]
 
 
 def view(
@@ -96,12 +104,13 @@ def view(
     """
     rubric, grade = entry.rubric, entry.grade
     comments = {id_: own.text for id_, own in entry.comments.items()}
+    held = tuple(asked.title or asked.id for asked in entry.held)
     if audience == "staff":
         grade = grade if names is None else anonymise(grade, names)
-        return GradeView(grade=grade, rubric=rubric, comments=comments)
+        return GradeView(grade=grade, rubric=rubric, comments=comments, held=held)
     if rubric.anonymous:
         grade = anonymise(grade, {entry.submission: entry.submission})
-    return new_view(grade, rubric, comments=comments, see=see)
+    return replace(new_view(grade, rubric, comments=comments, see=see), held=held)
 
 
 def new_view(
