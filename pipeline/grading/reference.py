@@ -19,6 +19,12 @@ OFF_SCALE = "the recordings are not in the stated units"
 _SLOWEST = 0.3  # s between samples; benches sample 20 times as often, or more
 
 
+# Sources of a reference other than the recordings: the true value of a team's bench, and the
+# student's other numbers.
+TRUE, OWN = "answer_key", "own"
+_GIVES = {TRUE: "your bench has", OWN: "your other numbers give"}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reference:
     """A parameter computed from the recordings.
@@ -48,6 +54,11 @@ class Reference:
         if self.low > 0 and self.within(limits.ONE_NUMBER):
             return f"{self.value:.4g}"
         return f"{self.low:.3g} to {self.high:.3g}"
+
+    @property
+    def said_of(self) -> str:
+        """What gives the reference, in words that precede it."""
+        return _GIVES.get(self.source, "your recordings give")
 
     def within(self, factor: float) -> bool:
         """Return whether the ratio of the bounds is at most a factor."""

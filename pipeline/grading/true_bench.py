@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from pipeline.errors import ConfigError
 from pipeline.grading import limits
 from pipeline.grading.gradings import HandIn
-from pipeline.grading.reference import Reference, References, recompute
+from pipeline.grading.reference import TRUE, Reference, References, recompute
 from pipeline.ingest.columns import conversion
 from pipeline.json_files import json_text
 from pipeline.names import read_name
@@ -27,8 +27,6 @@ from pipeline.words.progress import Progress
 
 if TYPE_CHECKING:
     from pipeline.simulated.bench import SimulatedBench
-
-SOURCE = "answer_key"  # the source of a reference that is a true value
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,8 +89,8 @@ class TrueBench:
             if value is None:
                 return one
             if is_own:
-                return replace(one.including(value), value=value, source=SOURCE)
-            return Reference.at(value, source=SOURCE).including(self.found.get(name, value))
+                return replace(one.including(value), value=value, source=TRUE)
+            return Reference.at(value, source=TRUE).including(self.found.get(name, value))
 
         def table(of: Mapping[str, Reference]) -> dict[str, Reference]:
             return {name: true(name, one) for name, one in of.items()}

@@ -14,9 +14,10 @@ from pipeline.grading import rubric as asked
 from pipeline.grading.gradings import HandIn
 from pipeline.grading.judge.checks import judge
 from pipeline.grading.judge.run import Graded, grade_submission, prepare_work
-from pipeline.grading.reference import Reference, References, recompute
+from pipeline.grading.mistakes.table_flags import off_flag
+from pipeline.grading.reference import TRUE, Reference, References, recompute
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.grading.true_bench import SOURCE, TrueBench, with_benches
+from pipeline.grading.true_bench import TrueBench, with_benches
 from pipeline.json_files import json_text
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.effect import EffectTerm
@@ -116,9 +117,16 @@ def test_bounds_are_those_of_the_own_bench():
     assert not true.shows_in(others)
     assert not true.shows_in(measured({"K": K, "omega_n": 1.1 * omega}))  # half agree by chance
     judged = true.references(own, is_own=True).final["K"]
-    assert (judged.value, judged.high, judged.source) == (K, 1.01 * K, SOURCE)
+    assert (judged.value, judged.high, judged.source) == (K, 1.01 * K, TRUE)
     judged = true.references(others, is_own=False).final["K"]
     assert (judged.low, judged.high) == (K, K)
+    typed = {"K": Decimal("3.00")}
+    flags = [
+        off_flag(typed, ["K"], {"K": Reference.at(K, source=source)}, "final")
+        for source in (TRUE, "bode_fit")
+    ]
+    assert flags[0].evidence["recomputed"] == flags[1].evidence["recomputed"]
+    assert flags[0].message != flags[1].message  # it says what the number is compared with
 
 
 def test_a_bench_belongs_to_the_name_of_a_submission(tmp_path):

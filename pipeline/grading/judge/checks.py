@@ -27,9 +27,9 @@ from pipeline.grading.judge.context import (
     share_sound,
     share_there,
 )
-from pipeline.grading.mistakes.state_model import OWN, derived_numbers, model_harm, order_names
+from pipeline.grading.mistakes.state_model import derived_numbers, model_harm, order_names
 from pipeline.grading.mistakes.undo import Number
-from pipeline.grading.reference import OFF_SCALE, Reference, is_linear, off_scale
+from pipeline.grading.reference import OFF_SCALE, OWN, Reference, is_linear, off_scale
 from pipeline.grading.rubric import matching
 from pipeline.grading.tolerance import (
     ALL,
@@ -41,7 +41,6 @@ from pipeline.grading.tolerance import (
     points_for,
     points_for_one,
 )
-from pipeline.grading.true_bench import SOURCE
 from pipeline.grading.words import WORDS
 from pipeline.names import parameter_names, read_name
 from pipeline.plant.identities import parameter_orders, recover_from_parameters
@@ -161,7 +160,7 @@ def _parameters(criterion: asked.Parameters, context: GradingContext) -> Verdict
         deviations.append(_deviation(error, name))
         if points_for_one(criterion, deviations[-1]) < 1:
             wrong.add(name)
-            there = f", but {_whose(known[name])} {known[name].text}" if name in known else ""
+            there = f", but {known[name].said_of} {known[name].text}" if name in known else ""
             off.append(f"{name}: you report {table[name].text}{there}")
     left = (
         f" Not judged: {first_few(guessed, _NAMED)}."
@@ -185,11 +184,6 @@ def _parameters(criterion: asked.Parameters, context: GradingContext) -> Verdict
         found={n: float(table[n].value) for n in judged if n in table},
         agrees={n: n not in wrong for n in judged if n in table and n not in unproved},
     )
-
-
-def _whose(reference: Reference) -> str:
-    by_source = {SOURCE: "your bench has", OWN: "your other numbers give"}
-    return by_source.get(reference.source, "your recordings give")
 
 
 def _deviation(error: Fraction, name: str) -> Deviation:

@@ -14,7 +14,7 @@ from pipeline.arrays import Array
 from pipeline.grading import limits
 from pipeline.grading.grade import Flag
 from pipeline.grading.mistakes.undo import Number
-from pipeline.grading.reference import Reference
+from pipeline.grading.reference import OWN, Reference
 from pipeline.grading.tolerance import percent_off
 from pipeline.grading.words import WORDS
 from pipeline.names import derived_names, parameter_names, read_name
@@ -25,7 +25,6 @@ from pipeline.submission import ReportedStateSpace
 EntryKind = Literal["exact", "stiffness", "damping"]
 
 _NAMED = 3  # largest number of carts whose named parameters determine the chain
-OWN = "own"  # the source of a reference that follows from the student's other numbers
 _MODES = ("omega_a", "omega_b", "omega_c")
 _NULLS = ("omega_x", "omega_y")
 

@@ -85,6 +85,7 @@ def off_flag(
         message=WORDS.text(
             "off",
             name=worst,
+            whose=reference.said_of,
             recomputed=reference.text,
             reported=as_typed(typed),
             look=WORDS.text(look),

@@ -57,9 +57,8 @@ def export(
 
     Raises
     ------
-    ConfigError : a criterion is held back, so there is no total yet; the roster is not a table of
-        this platform, its maximum grade differs from the rubric's, or `out` has the name of a file
-        of another kind.
+    ConfigError : a criterion is held back, the roster is not a table of this platform, its maximum
+        grade differs from the rubric's, or `out` has the name of a file of another kind.
     """
     table = out if out.suffix.lower() == ".csv" and not out.is_dir() else None
     folder = table.parent if table else named_folder(out)

@@ -138,12 +138,13 @@ def everything(place, share: float) -> dict[str, object]:
         export_feedback(book, PLATFORMS["moodle"], place / "feedback.zip")
         with pytest.raises(RequestRefused) as refused:
             book.ask("team-1", "final-frequencies", why="please", by="s1")
-        own = book.own_feedback("team-1")
+        feedback = book.own_feedback("team-1")
+    assert feedback
     files = [path for path in place.rglob("*") if path.is_file() and "sqlite" not in path.name]
     return {
         **{str(path.relative_to(place)): path.read_bytes() for path in files},
-        "view": view(own, "team"),
-        "requests": own.requests,
+        "view": view(feedback, "team"),
+        "requests": feedback.requests,
         "refused": str(refused.value),
     }
 
