@@ -4,6 +4,7 @@ Each function about a decision checks it and returns the events to store.
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from math import floor
 from pathlib import Path
@@ -220,6 +221,46 @@ def undo(entry: Entry, criterion: str) -> Event:
         return give(entry, replace(wanted, why="taken back"))
     comment = before.what == "comment"
     return give(entry, replace(wanted, points=before.points, why=before.text, comment=comment))
+
+
+def hold(entry: Entry, held: bool, *, why: str = "") -> Event:
+    """Hold a grade back, or no longer.
+
+    Raises
+    ------
+    ConfigError : the reason is missing, or the grade is in this state already.
+    """
+    return _hold(held, bool(entry.hold), why=why)
+
+
+def hold_criterion(
+    criterion: str, held: bool, before: Collection[str], rubric: Rubric, *, why: str
+) -> Event:
+    """Hold a criterion back for the whole class, or no longer.
+
+    Parameters
+    ----------
+    before : the criteria that are held back already.
+
+    Raises
+    ------
+    ConfigError : the rubric has no such criterion or no other one to show, the reason is missing,
+        or the criterion is in this state already.
+    """
+    if criterion not in rubric.titles:
+        hint = nearest(criterion, [*rubric.titles])
+        raise ConfigError(f"{criterion}: the rubric has no such criterion{hint}")
+    if held and rubric.titles.keys() <= {*before, criterion}:
+        raise ConfigError("no criterion would be left: do not publish the grades instead")
+    return replace(_hold(held, criterion in before, why=why), criterion=criterion)
+
+
+def _hold(held: bool, before: bool, *, why: str) -> Event:
+    if held == before:
+        raise ConfigError("it is held back already" if held else "it is not held back")
+    if held and not why.strip():
+        raise ConfigError("give a reason")
+    return Event(what="held" if held else "let_go", text=why.strip())
 
 
 def is_repeated(entry: Entry, event: Event) -> bool:

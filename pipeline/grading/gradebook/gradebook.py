@@ -19,13 +19,7 @@ from pipeline.grading.grade import Grade, class_frame, read_grade
 from pipeline.grading.gradebook import decisions
 from pipeline.grading.gradebook.database import Database
 from pipeline.grading.gradebook.decisions import Conflict, RequestRefused, WantedPoints
-from pipeline.grading.gradebook.events import (
-    POINTS,
-    TOTAL,
-    Entry,
-    Event,
-    Request,
-)
+from pipeline.grading.gradebook.events import POINTS, TOTAL, Entry, Event, Request
 from pipeline.grading.gradebook.history import points_changes, read_history, rubric_changes
 from pipeline.grading.gradebook.rows import (
     GRADING,
@@ -706,13 +700,7 @@ class Gradebook:
         ------
         ConfigError : there is no reason, or it is held back already.
         """
-
-        def decide(entry: Entry) -> list[Event]:
-            if entry.hold or not why.strip():
-                raise ConfigError("it is held back already" if entry.hold else "give a reason")
-            return [Event(what="held", text=why.strip())]
-
-        self._decide(team, decide, by=by)
+        self._decide(team, lambda entry: [decisions.hold(entry, True, why=why)], by=by)
 
     def let_go(self, team: str, *, by: str) -> None:
         """Hold a submission's grade back no longer.
@@ -721,21 +709,13 @@ class Gradebook:
         ------
         ConfigError : it is not held back.
         """
-
-        def decide(entry: Entry) -> list[Event]:
-            if not entry.hold:
-                raise ConfigError("it is not held back")
-            return [Event(what="let_go")]
-
-        self._decide(team, decide, by=by)
+        self._decide(team, lambda entry: [decisions.hold(entry, False)], by=by)
 
     @property
     def held_criteria(self) -> tuple[str, ...]:
         """The criteria of the rubric that are held back for the whole class."""
         with self._database.reading() as connection:
-            last = self._last(connection)
-            held, titles = held_criteria(connection, last.assignment), read_rubric(last).titles
-        return tuple(criterion for criterion in held if criterion in titles)
+            return held_criteria(connection, self._last(connection))
 
     def hold_criterion(self, criterion: str, held: bool, *, why: str = "", by: str) -> None:
         """Hold a criterion back for the whole class, or no longer.
@@ -745,28 +725,13 @@ class Gradebook:
 
         Raises
         ------
-        ConfigError : the rubric has no such criterion or no other one to show, a reason or name is
-            missing, or the criterion already is in this state.
+        ConfigError : see `decisions.hold_criterion`.
         """
         with self._database.changing() as connection:
             last = self._last(connection)
-            now, titles = held_criteria(connection, last.assignment), read_rubric(last).titles
-            if criterion not in titles:
-                hint = nearest(criterion, [*titles])
-                raise ConfigError(f"{criterion}: the rubric has no such criterion{hint}")
-            if (criterion in now) == held:
-                raise ConfigError(f"{criterion}: is {'already' if held else 'not'} held back")
-            if held and (not why.strip() or not by.strip()):
-                raise ConfigError("give a reason and your name")
-            if held and titles.keys() <= {*now, criterion}:
-                raise ConfigError("no criterion would be left: do not publish the grades instead")
-            event = Event(
-                what="held" if held else "let_go",
-                criterion=criterion,
-                text=why.strip(),
-                by=by.strip(),
-                at=self._at(),
-            )
+            before = held_criteria(connection, last)
+            event = decisions.hold_criterion(criterion, held, before, read_rubric(last), why=why)
+            event = replace(event, by=by.strip(), at=self._at())
             add_event(connection, event, assignment=last.assignment)
 
     def n_waiting(self) -> int:
@@ -812,8 +777,7 @@ class Gradebook:
             if not self._is_readable(connection, assignment):
                 return None
             entry = self._entry(connection, submission, exact=True)
-            held = held_criteria(connection, self._last(connection).assignment)
-            return None if entry.hold else entry.without(held)
+            return None if entry.hold else entry
 
     def ask(
         self, submission: str, criterion: str, *, why: str, by: str, assignment: str = ""
@@ -891,11 +855,8 @@ class Gradebook:
             if released is not None and not self._is_readable(connection, released):
                 raise RequestRefused("the feedback is not released to students")
             row, entry = self._found(connection, team, exact=released is not None)
-            if released is not None:
-                if entry.hold:
-                    raise RequestRefused("the feedback is not released to students")
-                held = held_criteria(connection, self._last(connection).assignment)
-                entry = entry.without(held)
+            if released is not None and entry.hold:
+                raise RequestRefused("the feedback is not released to students")
             return self._store(connection, row, decide(entry), by=by, at=self._at())
 
     def _store(
@@ -933,13 +894,16 @@ class Gradebook:
 
         Parameters
         ----------
-        exact : whether only the submission's own name counts, and no author's.
+        exact : whether only the submission's own name counts, and no author's. Students name their
+            submission so, and read no criterion that is held back.
         """
         last, row = self._find(connection, team)
         if exact and row.name != team:
             raise ConfigError(f"{team}: is not the name of a submission")
         line = row, read_flag(row.shared)
-        return row, read_entries(connection, [line], rubric=read_rubric(last))[0]
+        (entry,) = read_entries(connection, [line], rubric=read_rubric(last))
+        held = held_criteria(connection, last) if exact else ()
+        return row, entry.without(held)
 
     def _named(self, connection: Connection, names: Sequence[str]) -> dict[str, tuple[Row, Entry]]:
         """Return the lines of the class list with these names, and what they say now."""

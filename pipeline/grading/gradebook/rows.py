@@ -334,15 +334,15 @@ def is_released(connection: Connection, assignment: str) -> bool:
     return connection.scalar(mine.order_by(events.c.id.desc()).limit(1)) == "released"
 
 
-def held_criteria(connection: Connection, assignment: str) -> tuple[str, ...]:
-    """Return the criteria of an assignment that are held back."""
+def held_criteria(connection: Connection, batch: Row) -> tuple[str, ...]:
+    """Return the criteria of a class list's rubric that are held back."""
     mine = select(events.c.criterion, events.c.what).where(
-        events.c.assignment == assignment,
+        events.c.assignment == batch.assignment,
         events.c.submission_id.is_(None),
         events.c.what.in_(HOLDS),
     )
     last = {row.criterion: row.what for row in connection.execute(mine.order_by(events.c.id))}
-    return tuple(criterion for criterion, what in last.items() if what == "held")
+    return tuple(id_ for id_ in read_rubric(batch).titles if last.get(id_) == "held")
 
 
 def add_event(
