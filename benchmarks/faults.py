@@ -79,7 +79,7 @@ def order_files(fault: Fault, checkout: Path) -> list[str]:
 
 
 def name_functions(fault: Fault) -> list[str]:
-    """Name the function or class with the fault, then those of its file that use it."""
+    """Name the function, class or constant with the fault, then what uses it in its file."""
     text = (CHECKOUT / "pipeline" / fault.file).read_text("utf-8")
     named, top, in_class = dict[str, str](), "", False
     for block in re.split(r"^(?= {0,4}(?:def|class) )", text, flags=re.MULTILINE)[1:]:
@@ -87,7 +87,8 @@ def name_functions(fault: Fault) -> list[str]:
         top, in_class = (top, in_class) if indent else (name, kind == "class")
         name = name if in_class and name[:2] != "__" else top
         named[name] = named.get(name, "") + block
-    names = [name for name, block in named.items() if fault.old in block]
+    line = text[text.rfind("\n", 0, text.index(fault.old)) + 1 :]
+    names = [name for name, block in named.items() if fault.old in block] or [line.split()[0]]
     for used in names:  # which grows
         using = (name for name, block in named.items() if re.search(rf"\b{used}\b", block))
         names += [name for name in using if name not in names]
@@ -113,12 +114,12 @@ def run_tests(
     began = sum(os.times()[2:4])
     with subprocess.Popen(command, cwd=checkout, env=environment, stdout=subprocess.PIPE) as run:
         try:
-            said = run.communicate(timeout=10 * most)[0].decode(errors="replace")
+            said = run.communicate(timeout=4 * most)[0].decode(errors="replace")
         except subprocess.TimeoutExpired:
             run.terminate()
             said = ""
     failed = re.search(r"^(?:FAILED|ERROR) (\S+)", said, re.MULTILINE)
-    if run.returncode > 0 and not failed:
+    if said and run.returncode > 0 and not failed:
         raise RuntimeError(f"pytest could not run:\n{said}")
     return Outcome(test=failed[1] if failed else "", seconds=sum(os.times()[2:4]) - began)
 

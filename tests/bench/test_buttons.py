@@ -12,7 +12,7 @@ from pipeline.bench.events import Action, Anomalies, Buttons, RunOutcome, Stoppe
 from pipeline.bench.experiments import readings_of
 from pipeline.bench.live_state import LiveState
 from pipeline.bench.raw import read_raw
-from pipeline.experiments.plan import PlanLimits
+from pipeline.experiments.plan import PlanLimits, load_plan
 from pipeline.protocol import Reading
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import Notes, causes, sine, write_work
@@ -168,3 +168,16 @@ def test_a_run_that_waits_for_a_person_can_be_ended(tmp_path, wish):
             assert state.press(wish, turn=state.buttons.turn)
     assert [getattr(one, "wish", one) for one in ended] == ["stopped" if wish == "stop" else wish]
     assert not list(work.glob("raw/*.raw"))
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_the_live_page_draws_targets_in_their_unit(closed, tmp_path):
+    """A target is an input in open loop and a set point in closed loop, in the unit of its axis."""
+    run = sine("dwell", seconds=2)
+    scales = 'input = { unit = "V", per_count = 1e-4 }'
+    live = LiveState(write_work(tmp_path, [run], scales=scales, per_count=0.002))
+    live.planned(load_plan(load_submission(tmp_path)), frozenset())
+    live.started(run.model_copy(update={"kind": "closed_loop"}) if closed else run)
+    live.readings([Reading(counts=(300, -100), target=50, duty=20, ms=10)], Anomalies())
+    (point,) = live.points(run=1, start=0)["points"]
+    assert point == pytest.approx((0.01, 0.002, 0.1 if closed else 0.005, 0.6, -0.2))

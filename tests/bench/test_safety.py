@@ -58,6 +58,32 @@ class Alone(Notes):
         raise ConfigError(f"{instruction}: nobody")
 
 
+ODD = Description(
+    name="odd", encoders=2, carts=2, commands=EXTENSIONS, input_per_count=1e-4,
+    position_unit="cm", position_per_count=0.002,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("counts", "cart"),
+    [((1250, 0), 0), ((1251, 0), 1), ((-1250, 0), 0), ((-1251, 0), 1), ((0, -1300), 2)],
+)
+def test_a_cart_may_not_pass_either_end_of_its_travel(counts, cart):
+    """`too_far` names the cart beyond 2.5 cm of 0.002 cm per count, on either side."""
+    limits = PlanLimits(input=0.5, travel=2.5)
+    order = ordered(sine("dwell", seconds=1), ODD, limits=limits, position=0.002)
+    said = order.too_far(Reading(counts=counts, target=0, duty=0, ms=0), carts=2)
+    assert [number for number in (1, 2) if f"cart {number} " in said] == [cart] * bool(cart)
+
+
+@pytest.mark.parametrize(("per_count", "duty"), [(1e-4, 100), (1.005e-4, 100), (1.07e-4, 93)])
+def test_the_nearest_amplitude_is_ordered(per_count, duty):
+    """`make_order` rounds the amplitude of 0.01 V to the nearest count of the bench."""
+    start = ordered(sine("dwell", seconds=1), ODD, per_count=per_count).commands[-1]
+    assert isinstance(start, Start)
+    assert start.amplitude == duty == round(0.01 / per_count)
+
+
 def test_lines_that_cannot_be_read_end_a_run(tmp_path):
     """If lines cannot be read, no limit can be checked, so the motor is stopped."""
     work = write_work(tmp_path, [sine("dwell", seconds=10)])

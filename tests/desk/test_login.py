@@ -359,7 +359,7 @@ def test_an_instructor_writes_only_in_the_workshop(lab, root):
 
 
 def test_forged_names_are_refused(lab):
-    """Only a request from the proxy with exactly one known name is accepted."""
+    """`ProxyLogin.enter` accepts only a request from the proxy with exactly one known name."""
     student = lab("s1")
     for who, status in (
         (lab(""), 403), (lab("root"), 403), (lab("s1", source="127.0.0.2"), 403), (student, 303),

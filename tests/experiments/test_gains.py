@@ -198,13 +198,14 @@ def test_the_scale_of_the_submission_replaces_that_of_the_bench(identified):
         (PidLoop(kp=3.0, kd=0.02), PlanLimits(input=0.1, travel=2.5), 1.0, "input"),
         (StateLoop(), PlanLimits(input=0.01, travel=2.5), 1.0, "input .*0.01"),
         (StateLoop(), PlanLimits(input=0.5, travel=0.9), 1.0, "travel limit"),
+        (StateLoop(), PlanLimits(input=0.5, travel=0.9), -1.0, "travel limit"),
         (StateLoop(), LIMITS, 40.0, "(moves a cart|needs an input|would overshoot)"),
         (StateLoop(gains=(0.0, -1.0), prefilter=1.0), LIMITS, 1.0, "unstable"),
         (StateLoop(cart=2), LIMITS, 1.0, "cart 2"),
     ],
 )
 def test_a_loop_that_would_do_harm_is_refused(loop, limits, amplitude, message):
-    """A loop that is unstable, passes a limit or is not the designed one is refused."""
+    """The gains of a loop that is unstable or passes a limit on either side are refused."""
     submission = recorded("one-cart", "step", "sweep")
     with pytest.raises(DataError, match=message) as caught:
         gains_of((submission, analyse(submission)), loop, limits=limits, amplitude=amplitude)

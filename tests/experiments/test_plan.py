@@ -18,6 +18,7 @@ from pipeline.experiments.plan import (
     plan_path,
     plan_text,
     save_plan,
+    session_time,
 )
 from pipeline.experiments.propose import (
     AIM,
@@ -373,6 +374,7 @@ STATE = 'controller = {{type = "state_feedback", {}}}'
                 ("id", {"id": "../up"}),
                 ("carts", {"carts": "[1, 3]"}),
                 ("amplitude", {"carts": "[2]"}),
+                ("amplitude", {"carts": "[2]", "amplitude": -0.2}),
                 ("amplitude", {"amplitude": 6}),
                 ("amplitude", {"amplitude": 0}),
                 ("frequency", {"frequency": 2000}),
@@ -428,3 +430,18 @@ def test_the_command_writes_shows_and_extends(tmp_path):
     assert data["seconds_left"] == pytest.approx(119.0)
     assert "0 recordings" in again.stderr
     assert (tmp_path / "bench" / "plan.toml").read_bytes() == raw
+
+
+def test_the_time_of_a_session_includes_the_rests():
+    """The `session_time` is that of all recordings and of the rests before them."""
+    run = Recording(
+        id="a",
+        kind="sine",
+        carts=(1,),
+        wave="sine",
+        amplitude=0.1,
+        frequency=2.0,
+        cycles=8,
+        settle=3,
+    )
+    assert session_time([run, run.model_copy(update={"settle": 0.5})]) == 2 * 4.0 + 3.5

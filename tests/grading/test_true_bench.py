@@ -177,6 +177,7 @@ FRICTION = {"coulomb_friction": {"cart": 1, "force": Decimal("0.0031")}}
     [
         (FRICTION, 1),
         ({"coulomb_friction": {"cart": 1, "force": Decimal("0.0060")}}, Fraction(2, 3)),
+        ({"coulomb_friction": {"cart": 2, "force": Decimal("0.0031")}}, Fraction(2, 3)),
         ({"coulomb_friction": {"cart": 1}}, Fraction(2, 3)),
         ({"coulomb_friction": {"force": Decimal("0.0031")}}, Fraction(2, 3)),
         (FRICTION | {"input_delay": {"delay": Decimal("0.01")}}, Fraction(3, 4)),

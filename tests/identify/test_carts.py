@@ -2,13 +2,14 @@
 
 import shutil
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.estimation.estimates import SIGMA_LIMIT
-from pipeline.identify.model_checks import NEGLIGIBLE, check_carts, check_vanishing
+from pipeline.identify.model_checks import NEGLIGIBLE, check_carts, check_vanishing, say_law
 from pipeline.names import toml_flags
 from pipeline.plant.chain import PRESETS, Chain
 from pipeline.resources import EXAMPLES
@@ -153,3 +154,12 @@ def test_a_far_spring_that_the_real_rig_lacks_is_asked_about(tmp_path):
     said = {check.about: check.message for check in checks if check.kind == "springs"}
     assert list(said) == ["k_3"]
     assert toml_flags([True, True, False]) in said["k_3"]
+
+
+@pytest.mark.parametrize(("size", "side"), [(0.02, "higher"), (-0.02, "lower")])
+def test_the_frequency_of_large_swings_is_said_as_it_is(size, side):
+    """`say_law` calls the frequency of large swings higher if the size of the law is positive."""
+    (decay, *_) = make_analysis(1).log_decrements
+    law = replace(decay.law, name="frequency_shift", size=size, size_std=1e-3)
+    said = say_law(replace(decay, law=law), unit="cm")
+    assert [word for word in ("higher", "lower") if word in said] == [side]

@@ -393,3 +393,17 @@ def test_one_place_can_have_only_one_dry_friction():
         prepare_bench(preset="throne-2dof", hide=["coulomb_friction", "stiction"])
     hide = ["coulomb_friction", "stiction:cart=2"]
     assert len(prepare_bench(preset="throne-2dof", hide=hide).effects) == 2
+
+
+@pytest.mark.parametrize(
+    ("unit", "centimetre"),
+    [("cm", 1.0), ("mm", 10.0), ("m", 0.01), ("in", 1 / 2.54), ("count", 1 / 0.00227)],
+)
+def test_a_bench_from_a_file_travels_a_centimetre(unit, centimetre, tmp_path):
+    """A bench that `prepare_bench` reads has the travel and counts of the lab, in its unit."""
+    chain = {"m": [2e-4], "c": [5e-4], "k": [0.03, 0.0]}
+    model = {"chain": chain, "units": {"position": unit, "input": "V"}}
+    (tmp_path / "gap.json").write_text(json.dumps(model))
+    bench = prepare_bench(model=tmp_path / "gap.json")
+    assert bench.travel == pytest.approx(centimetre)
+    assert bench.count == pytest.approx(0.00227 * centimetre)

@@ -138,6 +138,18 @@ def test_gains_that_only_work_on_paper_keep_a_quarter_at_most():
     assert "unstable" in found.message
 
 
+@pytest.mark.parametrize(("factor", "share"), [("1", 1), ("-1", 0), ("1.5", 0)])
+def test_a_prefilter_needs_the_sign_of_its_loop(factor, share):
+    """`judge_prefilter` gives nothing for the right size with the wrong sign."""
+    one = student(1)
+    feedback = one.reported.feedback
+    assert feedback is not None
+    assert feedback.prefilter is not None
+    other = feedback.model_copy(update={"prefilter": feedback.prefilter * Decimal(factor)})
+    found = criterion(one.reporting(feedback=other).grade(), "prefilter")
+    assert found.points == share * found.out_of
+
+
 # -------------------------------------------------------------- the least cost of a flag
 
 

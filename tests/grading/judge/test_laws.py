@@ -46,6 +46,16 @@ def test_table_3_of_the_paper_breaks_known_laws():
     assert failed < broken(TABLE_3, n=3)
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "holds"),
+    [("24.3", "24.3", True), ("24.3", "24.4", True), ("24.3", "24.5", False), ("24.3", "20", True)],
+)
+def test_rounding_excuses_gains_in_the_wrong_order(first, second, holds):
+    """`judge_laws` finds the order of two gains broken only beyond half a digit of each."""
+    found = broken({**TABLE_2, "K_1": first, "K_2": second}, n=2)
+    assert ("order.K_2.K_1" in found) == (not holds)
+
+
 def test_one_digit_does_not_excuse_every_broken_law():
     """If a table is typed with one digit, rounding does not excuse every broken law."""
     vague = {name: f"{float(value):.0e}" for name, value in TABLE_2.items()}

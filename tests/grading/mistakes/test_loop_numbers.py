@@ -1,10 +1,14 @@
 """Reported gains are judged by simulating their loop, however fast the controller samples."""
 
+from decimal import Decimal
+
 import numpy as np
 import pytest
 
-from pipeline.grading.mistakes.controller import loop_numbers
-from pipeline.plant.chain import Chain
+from pipeline.estimation.state_feedback import design_feedback
+from pipeline.grading.mistakes.controller import Controller, diagnose_controller, loop_numbers
+from pipeline.plant.chain import PRESETS, Chain
+from pipeline.submission import Design
 
 CHAIN = Chain(m=np.array([1.0]), c=np.array([0.2]), k=np.array([4.0, 0.0]))
 OMEGA, ZETA = 6.0, 0.6
@@ -37,3 +41,30 @@ def test_a_loop_without_a_static_gain_has_no_step_figures():
     )
     gains = np.array([0.0028, 0.0005])
     assert loop_numbers(stiff, gains, cart=1, settling=1.0, sample_time=None) is None
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        lambda g: -g,
+        lambda g: [g[0], g[2], g[1], g[3]],  # positions first
+        lambda g: [g[2], g[3], g[0], g[1]],  # of the other cart
+        lambda g: [g[1], g[0], g[3], g[2]],  # positions and velocities exchanged
+        lambda g: [g[0], g[1], -g[2], g[3]],
+    ],
+    ids=["signs", "positions first", "carts", "exchanged", "one sign"],
+)
+def test_every_known_mistake_in_gains_is_undone(mistake):
+    """`diagnose_controller` finds the gains that were meant, which are those that ran."""
+    chain, goal = PRESETS["throne-2dof"], Design(cart=2, sample_time=0.00884)
+    right = design_feedback(chain, goal)
+    controller = Controller(
+        gains=np.array(mistake(right.gains)), prefilter=Decimal(f"{right.prefilter:.4g}"),
+        overshoot=Decimal(f"{right.overshoot_percent:.2g}"),
+        settling=Decimal(f"{right.settling_time:.3g}"), ran=right.gains, models=(chain,), goal=goal,
+        blurred=False, own=True, reference=chain,
+    )  # fmt: skip
+    flags, meant = diagnose_controller(controller)
+    assert [flag.code for flag in flags] == ["wrong_gains"]
+    assert flags[0].evidence["slip"]
+    assert meant == pytest.approx(right.gains)

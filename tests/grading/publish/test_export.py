@@ -480,10 +480,11 @@ def test_a_gradebook_of_moodle_in_another_language_is_filled_in(tmp_path):
     ],
 )
 def test_a_roster_with_another_maximum_is_refused(tmp_path, platform, roster):
-    """A roster with a different maximum is refused, since the platform would keep its own."""
+    """`check_maximum` refuses another maximum, since the platform would keep its own."""
     write(tmp_path, HALF, platform=platform, title="Lab 3", roster=roster.format('"20.00"'))
-    with pytest.raises(ConfigError, match=r"18\.00.* 20"):
-        write(tmp_path, HALF, platform=platform, title="Lab 3", roster=roster.format("18.00"))
+    for other in ("18.00", "100.00"):
+        with pytest.raises(ConfigError, match=rf"{other}.* 20"):
+            write(tmp_path, HALF, platform=platform, title="Lab 3", roster=roster.format(other))
 
 
 @pytest.mark.parametrize(

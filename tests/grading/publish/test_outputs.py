@@ -25,8 +25,10 @@ from pipeline.grading.publish.feedback import evidence_table, feedback_page, num
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
 from pipeline.grading.publish.pseudonyms import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.publish.view import new_view
+from pipeline.grading.similarity.shared_flag import student_message
 from pipeline.grading.words import WORDS
 from pipeline.setup import Units
+from pipeline.submission.models import Students
 from pipeline.words.text import plain
 from tests.helpers.grades import (
     book_of,
@@ -536,3 +538,21 @@ def test_a_table_of_a_platform_is_read_whatever_its_separators(tmp_path):
         path.write_text(f"a{much}\n", encoding="utf-8")
         with pytest.raises(ConfigError, match=r"t\.csv: .* 2000 .* 100000"):
             read_table(path)
+
+
+@pytest.mark.parametrize(
+    ("rubric", "user", "hides"),
+    [("report", None, False), ("check", None, True), ("report", "check", True),
+     ("check", "report", False)],
+)  # fmt: skip
+def test_what_a_person_may_see_decides_over_the_rubric(rubric, user, hides):
+    """`new_view` hides numbers by the list of users if it says so, else by the rubric."""
+    asked = two_cart_rubric().model_copy(update={"students": Students(see=rubric)})
+    assert new_view(make_grade("team-1"), asked, see=user).hides_numbers == hides
+
+
+def test_a_student_is_not_told_whose_recording_it_is():
+    """The `student_message` of shared recordings names no other team."""
+    flag = shared_flag("team-77")
+    assert "team-77" in flag.message
+    assert "team-77" not in student_message(flag)

@@ -13,6 +13,7 @@ from pipeline.grading.similarity.class_questions import (
     find_repeated_authors,
     with_recordings,
 )
+from pipeline.grading.similarity.copies import same_team
 from pipeline.grading.similarity.fingerprints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.simulated.submission import write_submission
@@ -110,3 +111,21 @@ def test_nobody_is_reported_for_one_submission():
     (double,) = find_repeated_authors({f"t{i}": ("S\n1",) for i in range(10)})
     assert str(double).startswith("S 1 ")
     assert "2 more" in str(double)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "same"),
+    [
+        (("a", "b"), ("a", "b"), True),
+        (("a", "b"), ("c", "B "), True),
+        (("a", "b"), ("c", "d"), False),
+        ((), (), False),
+    ],
+)
+def test_teams_with_a_common_person_are_the_same_team(first, second, same):
+    """A new partner makes no other team (`same_team`): shared recordings are then no copies."""
+    one, other = (
+        make_outcome(make_grade(name, authors=authors))
+        for name, authors in (("team-1", first), ("team-2", second))
+    )
+    assert same_team(one, other) == same
