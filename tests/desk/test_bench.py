@@ -10,12 +10,15 @@ import threading
 from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from urllib.parse import urlencode
 
 import pytest
 
 from pipeline.bench.raw import read_raw
 from pipeline.desk.app import DeskServer
+from pipeline.desk.benches import BenchSession
 from pipeline.experiments.plan import load_plan
 from pipeline.report.exploration import NAME as DIARY
 from pipeline.submission import load_submission
@@ -248,3 +251,23 @@ def test_new_recordings_in_the_plan_are_marked(tmp_path):
         rows = re.findall(r"<tr.*?</tr>", visitor.get("/bench/0/").text, re.DOTALL)
         marked = [re.findall(r'class="chip \w+">(\w+)<', row) for row in rows if "checkbox" in row]
         assert marked == [["next"], [], ["new"]]
+
+
+@pytest.mark.parametrize(
+    ("wish", "number", "counts"),
+    [
+        ("stop", 0, True),  # at any time
+        ("skip", 7, True),
+        ("skip", 6, False),  # of an earlier recording
+        ("keep", 7, False),  # not offered now
+        ("done", 3, True),
+        ("done", 2, False),
+    ],
+)
+def test_only_a_button_that_is_offered_counts_but_stop_always(wish, number, counts):
+    """`apply` sends a button to the bench if it is offered in this turn, and a stop always."""
+    sent: list[bytes] = []
+    state = {"instruction": {"number": 3}, "offered": ["skip"], "turn": 7}
+    session: Any = SimpleNamespace(_state=state, _process=SimpleNamespace(send=sent.append))
+    assert BenchSession.apply(session, wish, number) == counts
+    assert len(sent) == counts

@@ -4,12 +4,15 @@ import io
 import re
 import zipfile
 from html import unescape
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from pipeline.desk.app import ROUTES
 from pipeline.desk.student.files import list_held, list_missing
-from pipeline.desk.users import read_users
+from pipeline.desk.users import User, Visibility, read_users
 from pipeline.errors import ConfigError
 from pipeline.grading.self_check.answers import FILE, read_answers
 from pipeline.resources import RUBRICS
@@ -207,3 +210,21 @@ def test_the_ta_sees_how_often_the_check_was_run(root):
                  "--out", root / "grades", "--jobs", 1, "--no-figures")  # fmt: skip
     with at_desk(opened=root / "grades") as ta:
         assert "run 2 times" in ta.get("/grades/0/team?of=other").text
+
+
+@pytest.mark.parametrize(
+    ("role", "see", "task", "told"),
+    [
+        ("student", "check", "make_report", False),
+        ("student", "check", "check_numbers", True),
+        ("student", "report", "make_report", True),
+        ("instructor", "check", "make_report", True),
+    ],
+)
+def test_the_stages_of_a_report_are_hidden_from_those_who_may_only_check(role, see, task, told):
+    """`show_job` leaves out the message of a task that tells computed numbers."""
+    workers: Any = None  # none of these cases asks a worker
+    job: Any = SimpleNamespace(task=(task,), message="K = 24.3", without_message=lambda: None)
+    user = User(name="s1", role=role, see=see)
+    shown = Visibility(workers).show_job(job, user, Path("team"))
+    assert (shown is job) == told

@@ -241,7 +241,9 @@ def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
     for step in (r"asked +laws: by s4: see page 3", r"answered +laws: 0.5 by hand, by Ada"):
         assert re.search(step, team)
     assert ask(student).status == 422
+    assert 'id="why-laws"' not in student.get(HERE).text
     assert ta.post(QUEUE, do="reopen", **fields(ta.get(QUEUE))).status == 303
+    assert 'id="why-laws"' in student.get(HERE).text
     assert ask(student, why="and page 4").status == 303
 
 

@@ -14,6 +14,7 @@ from urllib.parse import quote, urlencode, urlsplit
 import pytest
 
 from pipeline.desk.app import DeskServer
+from pipeline.desk.gradebooks import ClassView
 from pipeline.grading.grade import Flag
 from pipeline.grading.gradebook.events import Event
 from pipeline.grading.gradebook.gradebook import Gradebook
@@ -171,6 +172,20 @@ def test_a_large_class_comes_a_page_at_a_time(tmp_path):
         assert list(chain(*shown)) == [outcome.submission for outcome in outcomes]
         for odd in ("0", "-1", "9" * 40, "x", "4"):
             assert names(who.get(f"{ROOM}?page={odd}"))
+
+
+def test_the_order_of_hidden_names_tells_nothing(tmp_path):
+    """The `teams` of an anonymous class come in the order of their pseudonyms."""
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        outcomes = [make_outcome(make_grade(f"t{n:02d}")) for n in range(12)]
+        for outcome in outcomes:
+            book.put(outcome)
+        rubric = two_cart_rubric().model_copy(update={"anonymous": True})
+        book.finish(Batch(keys=tuple(one.key for one in outcomes), shared={}), rubric=rubric)
+        teams = ClassView(book.class_now(), book.state()).teams
+    assert len(teams) == 12
+    assert list(teams) == sorted(teams)
+    assert all(name.startswith("anon-") for name in teams)
 
 
 def test_each_criterion_shows_its_recordings(tmp_path):
