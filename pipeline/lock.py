@@ -35,8 +35,8 @@ def lock_or_refuse(out: Path, *, private: bool = False) -> Iterator[None]:
         with _locked(lock, patience=0.0):
             yield
     finally:
-        if new and list(out.iterdir()) == [lock]:
-            lock.unlink()
+        if new and all(path == lock for path in out.iterdir()):
+            lock.unlink(missing_ok=True)  # on Windows it is gone already
             out.rmdir()
 
 

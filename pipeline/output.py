@@ -6,6 +6,7 @@ Tables are written so that a spreadsheet does not run any formula that a student
 import os
 import re
 import secrets
+import sys
 import time
 import zipfile
 from collections.abc import Container, Iterable, Sequence
@@ -19,6 +20,9 @@ from pipeline.errors import ConfigError
 
 OWNER_ONLY, OWNERS_FOLDER = 0o600, 0o700  # modes of files and folders with students' names
 LOCK, TURN = ".lock", ".turn"  # lock files, see `pipeline.lock`
+# On Windows these names are devices, with any ending: what is written to `aux.txt` is lost.
+DEVICE = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
+_PAUSES = (0.02, 0.05, 0.1, 0.2, 0.4)  # s between attempts to replace a file that is being read
 # Not a formula although it begins like one: a number, or the dash for a missing value.
 _PLAIN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|-", re.ASCII)
 # Characters that start a formula, wide and small forms included, at the start of a cell or after a
@@ -93,10 +97,20 @@ def write_file(path: Path, content: str | bytes, *, private: bool = False) -> No
     try:
         with open(part, "xb", opener=_for_the_owner if private else None) as file:
             file.write(raw)
-        part.replace(path)
+        _move_over(part, path)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def _move_over(part: Path, path: Path) -> None:
+    """Replace a file; Windows refuses this while another program has it open, so try again."""
+    for pause in _PAUSES if sys.platform == "win32" else ():
+        with suppress(PermissionError):
+            part.replace(path)
+            return
+        time.sleep(pause)
+    part.replace(path)
 
 
 def _for_the_owner(path: str, flags: int) -> int:

@@ -63,6 +63,21 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
 
 
+@pytest.mark.parametrize("released", [False, True])
+def test_a_new_folder_that_stays_empty_is_removed(tmp_path, released):
+    """The folder is removed also on Windows, where a lock that is released removes its file."""
+    new, old = tmp_path / "new", tmp_path / "old"
+    old.mkdir()
+    for folder in (new, old):
+        with lock_or_refuse(folder):
+            if released:
+                (folder / ".lock").unlink()
+    assert (new.exists(), old.exists()) == (False, True)
+    with lock_or_refuse(new):
+        (new / "report.html").touch()
+    assert (new / "report.html").is_file()
+
+
 _EDITOR = """
 import sys
 from pathlib import Path
@@ -100,7 +115,7 @@ def test_an_edit_waits_for_that_of_another_process(tmp_path):
 def test_a_foreign_file_with_the_locks_name_is_refused(tmp_path):
     """If a file has the lock's name but is not a lock, the run stops with a message."""
     (tmp_path / ".lock").write_bytes(b"something else" * 100)
-    with pytest.raises(ConfigError, match="not a lock of cartlab"), lock_or_refuse(tmp_path):
+    with pytest.raises(ConfigError, match="not a lock"), lock_or_refuse(tmp_path):
         pass
 
 

@@ -1,11 +1,14 @@
 """An output file is written whole, in its own folder, and never through a link."""
 
 import csv
+import errno
 import io
 import os
 import re
 import unicodedata
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +32,31 @@ def test_a_file_is_replaced_whole(tmp_path):
     write_file(path, "old")
     write_file(path, "ω\n")
     assert path.read_bytes() == "ω\n".encode()
+    assert [p.name for p in tmp_path.iterdir()] == ["results.json"]
+
+
+@pytest.mark.parametrize("failures", [3, 99])
+def test_a_file_that_is_being_read_on_windows_is_replaced(tmp_path, failures, monkeypatch):
+    """Windows replaces no open file: a write tries again for a while, and then fails cleanly."""
+    path, move, left = tmp_path / "results.json", Path.replace, [failures]
+    write_file(path, "old")
+
+    def refused(part: Path, target: Path) -> Path:
+        left[0] -= 1
+        if left[0] >= 0:
+            raise PermissionError(errno.EACCES, "Access is denied", str(part))
+        return move(part, target)
+
+    monkeypatch.setattr(Path, "replace", refused)
+    monkeypatch.setattr("pipeline.output.sys.platform", "linux")
+    with pytest.raises(PermissionError):  # other systems replace open files: this is final there
+        write_file(path, "new")
+    assert left == [failures - 1]
+    monkeypatch.setattr("pipeline.output.sys.platform", "win32")
+    monkeypatch.setattr("pipeline.output.time.sleep", lambda _: None)
+    with pytest.raises(PermissionError) if failures == 99 else nullcontext():
+        write_file(path, "new")
+    assert path.read_text() == ("old" if failures == 99 else "new")
     assert [p.name for p in tmp_path.iterdir()] == ["results.json"]
 
 
@@ -78,7 +106,7 @@ def test_a_folder_that_may_not_be_used_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"link.*--out"):
         own_folder(tmp_path, "report")
     assert check_folder(link).is_dir()  # allowed if the user names it
-    with pytest.raises(ConfigError, match="out: is a file"):
+    with pytest.raises(ConfigError, match=r"out: .*file"):
         check_folder(file)
     assert new_folder(tmp_path / "fresh") == tmp_path / "fresh"
     assert new_folder(elsewhere) == elsewhere

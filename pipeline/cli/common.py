@@ -6,6 +6,7 @@ Each command imports its own heavy modules, so that `--help` answers at once.
 """
 
 import errno
+import os
 import re
 import shutil
 import signal
@@ -89,8 +90,8 @@ def run() -> None:
     Print an error that the user can fix as one line, with exit status 2.
     """
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # a console that lacks a character shows it as \u…
-            stream.reconfigure(errors="backslashreplace")
+        if isinstance(stream, TextIOWrapper):
+            set_encoding(stream, platform=sys.platform)
     try:
         status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
         # Typer turns Ctrl-C into this status; a command that has said so raises SystemExit.
@@ -104,6 +105,17 @@ def run() -> None:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         _fail(f"{where}{error.strerror or error}{_hint(error)}")
+
+
+def set_encoding(stream: TextIOWrapper, *, platform: str) -> None:
+    """Let a console show a character that it lacks as its number; on Windows, pipes get UTF-8.
+
+    There they would get the code page of the user's language, in which no program expects JSON.
+    """
+    stream.reconfigure(errors="backslashreplace")
+    chosen = os.environ.get("PYTHONIOENCODING") or stream.isatty()
+    if platform == "win32" and not chosen:
+        stream.reconfigure(encoding="utf-8", newline="\n")
 
 
 def _hint(error: OSError) -> str:

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError
 
 from pipeline.errors import ConfigError
 from pipeline.lock import lock_when_free
-from pipeline.output import write_file
+from pipeline.output import DEVICE, write_file
 from pipeline.protocol import FREQUENCIES, MOST_TONES, Tone
 from pipeline.submission import Submission, System, load_submission, toml
 from pipeline.submission.models import TomlTable
@@ -407,6 +407,8 @@ def recording_problems(
     if not _ID.fullmatch(recording.id):
         wanted = "letters, digits, dots, dashes; its data files are named after it"
         yield "id", f"expected {wanted}, found {toml.quote(recording.id)}"
+    if DEVICE.fullmatch(recording.id):
+        yield "id", f"{recording.id} is a device on Windows, not a file; choose another id"
     if not carts or len(set(carts)) < len(carts) or not all(1 <= cart <= n for cart in carts):
         yield "carts", f"expected some of the carts 1 to {n}, each once, found {list(carts)}"
     if recording.release is not None and recording.release not in carts:

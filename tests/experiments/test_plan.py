@@ -92,7 +92,7 @@ def test_a_stock_bench_gets_only_its_own_commands():
     (sweep,) = of_kind(propose_plan(bare(), bench=STOCK), "sweep")
     assert (sweep.wave, sweep.frequency_end) == ("square", None)
     whole = recorded("two-cart", *FIRST, "sine")
-    with pytest.raises(DataError, match=r"state system\.position\.per_count in cm"):
+    with pytest.raises(DataError, match=r"system\.position\.per_count in cm"):
         extend_plan(propose_plan(whole, bench=STOCK), whole, bench=STOCK)
     position = whole.system.position.model_copy(update={"per_count": 0.00227})
     system = whole.system.model_copy(update={"position": position})
@@ -398,6 +398,7 @@ STATE = 'controller = {{type = "state_feedback", {}}}'
             ]
         ),
         (with_run() + RUN.format(**{**GOOD, "id": "RUN"}), r"recordings\[2\]\.id "),
+        *((with_run(id=name), rf"\.id .*\b{name}\b") for name in ("aux", "Con.1")),
     ],
 )
 def test_a_mistake_is_one_line_that_names_the_key(tmp_path, text, message):

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.cli import main
+from pipeline.cli.common import set_encoding
 from tests.grading.publish.test_survey import write_paper
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.grades import book_of, make_grade, write_class
@@ -234,6 +235,26 @@ def test_an_anonymous_grading_names_nobody_on_stderr(tmp_path, monkeypatch):
     assert ": anon-" in said[1]
     for text in said:
         assert not [part for name in names for part in name.split("-") if part in text], text
+
+
+@pytest.mark.parametrize(
+    ("platform", "console", "expected"),
+    [
+        ("win32", False, "Ünal 学\n".encode()),  # a pipe or a file, which another program reads
+        ("win32", True, b"\xdcnal \\u5b66\n"),
+        ("linux", False, b"\xdcnal \\u5b66\n"),  # as the user chose
+    ],
+)
+def test_pipes_of_windows_get_utf_8(platform, console, expected, monkeypatch):
+    """On Windows, only a console gets the language's code page, in which JSON is not valid."""
+    monkeypatch.delenv("PYTHONIOENCODING", raising=False)
+    raw = io.BytesIO()
+    raw.isatty = lambda: console
+    stream = io.TextIOWrapper(raw, encoding="cp1252", newline="\n" if console else None)
+    set_encoding(stream, platform=platform)
+    stream.write("Ünal 学\n")
+    stream.flush()
+    assert raw.getvalue() == expected
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")

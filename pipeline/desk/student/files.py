@@ -21,7 +21,7 @@ from pipeline.grading.intake.unpack import HAND_IN, is_debris, unpack
 from pipeline.grading.self_check.answers import FILE as CHECKS
 from pipeline.ingest.files import ENDINGS
 from pipeline.lock import lock_when_free
-from pipeline.output import own_folder, write_file
+from pipeline.output import DEVICE, own_folder, write_file
 from pipeline.processes import Failed
 from pipeline.submission import load_submission
 from pipeline.submission.load import (
@@ -146,7 +146,7 @@ def _take(sent_name: str, raw: bytes, folder: Path, *, room: _Room) -> Message |
     name = printable.encode(errors="ignore")[-120:].decode(errors="ignore")
     # Replace characters that some systems refuse, and names that Windows reserves.
     name = re.sub(r'[<>:"/\\|?*\x00-\x1f\x7f]|^[. ~]+|[. ]+$', "-", name)
-    if re.fullmatch(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?", name):
+    if DEVICE.fullmatch(name):
         name = f"data-{name}"
     names = _list_names(own_folder(folder, "data") / name)
     target = next(path for path in names if not _is_there(path) or _holds(path, raw))

@@ -28,6 +28,7 @@ from pipeline.grading.intake.unpack import (
 )
 from pipeline.grading.platforms import Account, Upload, current, parse_name
 from pipeline.grading.rubric import Late
+from pipeline.output import DEVICE
 from pipeline.submission.load import NAME
 from pipeline.submission.toml import quote
 from pipeline.words.progress import Progress, silent
@@ -38,7 +39,6 @@ _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f\x7f-\x9f]')
 _RESULTS = ("class.html", "feedback/.made.json")  # these mark the output folder of a grading
 _PARTS_OF_RESULTS = ("feedback", "gradescope")
 _DATA = "data"  # folder of recordings; its name is never the id of a hand-in
-_RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -385,7 +385,7 @@ def fit_name(name: str) -> str:
     text = _NOT_IN_NAMES.sub("_", text.encode("utf-8", "replace").decode())
     text = "".join(c if c.isprintable() else "_" for c in text)[:_LONGEST_ID]
     text = text.encode()[:_MOST_BYTES].decode(errors="ignore").strip(" .")
-    return f"_{text}" if not text or _RESERVED.fullmatch(text) else text
+    return f"_{text}" if not text or DEVICE.fullmatch(text) else text
 
 
 _DAY = 86_400.0  # s

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from pipeline.errors import SubmissionError, is_name_fault
+from pipeline.output import DEVICE
 from pipeline.submission.toml import quote
 
 _CHUNK = 1 << 16
@@ -34,8 +35,8 @@ _UTF8_NAME, _ENCRYPTED = 0x800, 0x1
 _HEAD = 30  # bytes
 _MEMBER = re.compile(rb"PK\x03\x04.{22}(..)..", re.DOTALL)
 
-# On Windows a colon starts a stream, a final dot is dropped, and `nul.csv` is a device.
-_NOT_ON_WINDOWS = re.compile(r'(?i)[<>:"|?*\x00-\x1f]|[. ]$|^(con|prn|aux|nul|com\d|lpt\d)(\..*)?$')
+# On Windows a colon starts a stream, and a final dot is dropped.
+_NOT_ON_WINDOWS = re.compile(r'[<>:"|?*\x00-\x1f]|[. ]$')
 
 _DEBRIS_FOLDERS = ("__MACOSX",)
 _DEBRIS_FILES = (".ds_store", "thumbs.db", "desktop.ini")
@@ -359,7 +360,9 @@ def _path(info: zipfile.ZipInfo) -> PurePosixPath:
         raise _Refused(f"{quote(name)} points outside the archive")
     if not path.parts or "\0" in name:
         raise _Refused("a file without a name")
-    if sys.platform == "win32" and any(_NOT_ON_WINDOWS.search(part) for part in path.parts):
+    if sys.platform == "win32" and any(
+        _NOT_ON_WINDOWS.search(part) or DEVICE.fullmatch(part) for part in path.parts
+    ):
         raise _Refused(f"{quote(name)} is not a valid file name on Windows")
     if len(path.parts) > DEEPEST:
         raise _Refused(f"{quote(name)} is more than {DEEPEST} folders deep")
