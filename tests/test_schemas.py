@@ -112,7 +112,7 @@ def test_the_command_prints_the_schema():
     """`cartlab schema gap` prints the shipped schema; an unknown name gets the list of names."""
     done = cartlab_here("schema", "gap")
     assert done.stdout == (DOCS / "gap.schema.json").read_text(encoding="utf-8")
-    with pytest.raises(ConfigError, match="there are results, gap, solution, grade"):
+    with pytest.raises(ConfigError, match="results, gap, solution"):
         schema_text("report")
 
 

@@ -105,7 +105,7 @@ file = "data/sine-µ.txt"
     assert record.t[-1] == pytest.approx(39 * 1.0024e-3, abs=1e-3)
     heading, first, *_ = log_text(LINES, carts=1, reference=True).splitlines()
     assert heading.split("\t") == ["Sample", "Time", "Encoder 1 Pos", "Target", "Control Effort"]
-    assert first == "0\t0.000\t0\t0\t0"
+    assert first.split("\t") == ["0", "0.000", "0", "0", "0"]
 
 
 def test_a_raw_file_of_a_few_lines_makes_no_record(tmp_path):

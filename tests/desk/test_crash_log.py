@@ -1,6 +1,7 @@
 """A desk reports what ended it, and the next desk removes what it left."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -81,13 +82,14 @@ def test_a_desk_outlives_its_terminal_and_an_exception_in_another_thread(tmp_pat
             assert desk.stderr is not None
             desk.stdin.write("thread other\n")
             desk.stdin.flush()
-            assert desk.stderr.readline() == "cartlab: the desk: ValueError: boom in thread other\n"
+            assert re.fullmatch("cartlab: .*ValueError: boom.* other\n", desk.stderr.readline())
             assert visitor.get("/").status == 200
             desk.terminate()
             status, said, kept = ended()
     finally:
         signal.signal(signal.SIGHUP, before)
-    assert (status, said) == (0, "cartlab: the desk ends: SIGTERM\n")
+    assert (status, said.count("\n")) == (0, 1)
+    assert said.endswith(" ends: SIGTERM\n")
     assert kept.endswith(" ends: SIGTERM\n")
     assert 'raise ValueError("boom")' in kept or "ValueError: boom" in kept
 
@@ -167,7 +169,4 @@ def test_what_ends_a_desk_is_reported(sent, status, told, tmp_path):
         with a_desk(tmp_path) as (desk, _, ended):
             desk.terminate()
             _, said, _ = ended()
-        assert (
-            "an earlier desk was killed or crashed. Saved files are intact; its last change may "
-            f"be missing. The log says where a library crashed: {tmp_path}" in said
-        ) == again
+        assert [word in said for word in ("earlier desk", str(tmp_path))] == [again, again]

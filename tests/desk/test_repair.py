@@ -96,14 +96,14 @@ def test_a_repaired_file_is_graded_and_stays_repaired(handed_in, tmp_path):
         assert ta.post(TEAM, **sent, text=right.replace("\n", "\r\n"), why=WHY).status == 303
         until(lambda: current(out).status == "graded")
         page = unescape(ta.get(TEAM).text)
-        assert "This file was repaired here." in page
+        assert "was repaired here" in page
         assert "carts = 1,0" in page  # the original is shown too
 
     found = current(out)
     assert (found.points, found.repaired) == (20, f"by Ada: {WHY}")
-    assert f"submission.toml was repaired before grading: {WHY}" in found.notes
+    assert [note for note in found.notes if "repaired" in note and note.endswith(f": {WHY}")]
     said = cartlab_here("history", out, "team-07").stdout
-    assert f"submission.toml repaired by Ada: {WHY}" in said
+    assert f"repaired by Ada: {WHY}" in said
     assert path.read_bytes() == packed
     assert read_original(out, "team-07") == original
 
@@ -137,7 +137,7 @@ def test_the_history_names_who_repaired_a_file_that_cannot_be_graded(handed_in, 
     found = grade(path, out)
     assert (found.status, found.repaired) == ("failed", f"by Ada: {WHY}")
     said = cartlab_here("history", out, "team-07").stdout
-    assert f"submission.toml repaired by Ada: {WHY}" in said
+    assert f"repaired by Ada: {WHY}" in said
 
 
 @pytest.mark.slow

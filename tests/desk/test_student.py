@@ -265,7 +265,7 @@ def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
     expected = written.get(change, "older")
     for page in (visitor.get(HERE), visitor.get(HERE + "hand-in")):
         assert page.state["report"] == expected
-        assert ("The report is out of date" in page.text) == (expected == "older")
+        assert ("report is out" in page.text) == (expected == "older")
     top = visitor.get(HERE).text.partition('class="now')[2].partition('class="next')[0]
     said = {"older": "out of date", "current": "up to date", "answered": "are newer than"}
     assert [state for state, words in said.items() if words in top] == [expected]
@@ -679,10 +679,11 @@ def test_a_folder_accepts_files_up_to_the_limits(tmp_path, worker_here, monkeypa
         (tmp_path / name).write_bytes(bytes(100))
     assert take_upload("a.csv", io.BytesIO(b"x" * 10), tmp_path, workers=worker_here) == []
     (said,) = take_upload("b.csv", io.BytesIO(b"y" * 6), tmp_path, workers=worker_here)
-    assert "2 files and 15 bytes" in said
+    assert all(limit in said for limit in ("2 files", "15 bytes"))
     three = [(f"{n}.csv", io.BytesIO(b"123456"[:n])) for n in (4, 5, 6)]
     (said,) = take_uploads(three, tmp_path / "whole", workers=worker_here)
-    assert re.match("'6.csv': .* 2 files", said.text)
+    assert said.text.startswith("'6.csv': ")
+    assert "2 files" in said.text
 
 
 def test_only_our_own_files_are_served_and_nothing_in_them_runs(filled):
@@ -813,7 +814,7 @@ def test_warnings_that_differ_in_a_number_appear_once(room):
         rows = [f"{round(i * interval, 3)},{i // 50},{i % 99 * 7}" for i in range(400)]
         visitor.upload(HERE + "files", [(f"{name}.csv", table(*rows, head="time,input,x1"))])
     page = visitor.get(HERE).text
-    assert page.count("10.3 to 10.5 ms") == 1
+    assert page.count("10.3 to 10.5") == 1
     assert "10.4 ms" not in page
 
 

@@ -205,7 +205,7 @@ def test_phases_that_contradict_the_magnitudes_are_left_out(change):
 
     bare = [replace(r, phase=None, phase_std=None) for r in responses]
     expected = fit_bode(bare, bench=WALLS[2])
-    assert "the phases do not agree" in got.message
+    assert ["phases" in one.message for one in (got, expected)] == [True, False]
     assert got.parameters == expected.parameters
 
 
@@ -220,7 +220,7 @@ def test_a_misfit_widens_the_errors():
 
     got, honest = (fit_bode(one, bench=WALLS[2]) for one in (scattered, bold))
 
-    assert "away from the model" in got.message
+    assert ["away from" in one.message for one in (got, honest)] == [True, False]
     assert got.chi_square_per_dof > 1e4
     for name, value in chain.parameters().items():
         estimate, claimed = got.parameters[name], honest.parameters[name].std

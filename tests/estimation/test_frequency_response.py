@@ -103,7 +103,7 @@ def test_dwells_become_points(dwells, omega, magnitude, std, phase):
 
 def test_dwells_without_an_input_are_refused():
     """A dwell without an input amplitude is refused, since a gain needs one."""
-    with pytest.raises(DataError, match="dwells need a sinusoidal input"):
+    with pytest.raises(DataError, match="sinusoidal input"):
         collect_dwells([replace(dwell(omega=5.0, gain=2.0), input_amplitude=0.0)])
 
 

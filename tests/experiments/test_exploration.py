@@ -205,7 +205,7 @@ def test_a_goal_for_an_unknown_parameter_is_refused(tmp_path):
     wish = read_error_goal("Zeta 1%")
     known = a_recorded_cart(tmp_path / "known")
     for folder in (known, tmp_path / "unknown"):  # with known carts, and with unknown ones
-        with pytest.raises(ConfigError, match="did you mean 'zeta'"):
+        with pytest.raises(ConfigError, match="mean 'zeta'"):
             exploration(folder, record, goal=wish, seconds=900.0).run()
     assert not asked
     with pytest.raises(ConfigError, match="parameter"):
@@ -223,9 +223,9 @@ def test_an_exploration_ends_after_three_failures(tmp_path):
 
     turns = exploration(a_recorded_cart(tmp_path / "work"), record, seconds=900.0).run()
     assert len(set(asked)) == 3
-    assert [turn.summary.split("? ")[0] for turn in turns[1:]] == [
-        f"{name} failed: the line is silent: is it plugged in" for name in asked
-    ]
+    for turn, name in zip(turns[1:], asked, strict=True):
+        assert turn.summary.startswith(f"{name} failed: ")
+        assert "line is silent" in turn.summary
     assert not turns[-1].reached
 
 

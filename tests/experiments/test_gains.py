@@ -243,5 +243,5 @@ def test_a_proposed_pid_brings_cart_1_to_the_level(example):
     assert abs(run.x[0, -1] - 1.0) < 0.02
     assert run.x[0].max() < 1.1
     weak = PlanLimits(input=0.001, travel=2.5)
-    with pytest.raises(DataError, match=r"no PID is proposed: .*input"):
+    with pytest.raises(DataError, match=r"no PID .*input"):
         replace(trial, limits=weak).propose_pid()

@@ -241,7 +241,7 @@ def test_the_advice_describes_the_proposed_recording(verdict, kind, extra):
     assert ("0.123" in gap.next_experiment) == (kind != "decay")
     assert ("7.25" in gap.next_experiment) == (kind == "sweep")
     assert "0.070" in gap.next_experiment
-    assert ("let go at 0.5" in gap.next_experiment) == (kind == "decay")
+    assert ("go at 0.5" in gap.next_experiment) == (kind == "decay")
     assert json_text(read_gap(text := json_text(gap))) == text
 
 

@@ -84,11 +84,11 @@ def test_in_a_read_only_package_the_users_cache_is_used(package):
     nowhere = _outer(package, XDG_CACHE_HOME="/dev/null")
 
     assert first[0] == again[0] == "21"
-    assert "once on this computer" in first[1]
+    assert "on this computer" in first[1]
     assert again[1] == ""
     assert list(home.glob("cartlab/compiled-*/simulator-*/*/caller.outer*.nbc"))
     assert nowhere[0] == "21"
-    assert "it cannot be stored" in nowhere[1]
+    assert "cannot be stored" in nowhere[1]
 
 
 def test_the_folders_name_covers_each_file_that_a_compiled_function_uses():

@@ -87,9 +87,9 @@ def test_expressions_keep_their_value_in_octave(tmp_path):
 @pytest.mark.parametrize("text", ["a if b else c", "a < b", "[a]", "f(a)", "a @ b", "'a'"])
 def test_an_operation_that_laws_may_not_use_is_refused(text):
     """An operation that laws may not use is refused, for C and for MATLAB."""
-    with pytest.raises(ValueError, match="no part of a law"):
+    with pytest.raises(ValueError, match="no part of"):
         in_c(text)
-    with pytest.raises(ValueError, match="no part of a law"):
+    with pytest.raises(ValueError, match="no part of"):
         in_matlab(text, bodies=(), bristles=())
 
 

@@ -164,5 +164,5 @@ def test_a_replay_gives_the_logged_input():
 
 def test_a_pid_on_a_held_cart_is_refused():
     """A PID on a held cart is refused, as the cart cannot be controlled."""
-    with pytest.raises(DataError, match=r"cart 2 to be free, found free \[1\]"):
+    with pytest.raises(DataError, match=r"cart 2 .*\[1\]"):
         simulate_loop(TWO, Pid(kp=1.0, cart=2), t=CLOCK, reference=1.0, setup=LoopSetup(free=[1]))

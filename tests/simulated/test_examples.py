@@ -200,5 +200,5 @@ def test_the_controlled_cart_follows(sessions):
 
 def test_an_unknown_preset_names_the_known_ones(tmp_path):
     """A misspelt preset gives an error that lists the known presets."""
-    with pytest.raises(ConfigError, match=r"no preset 'throne-4dof': there are throne-1dof, "):
+    with pytest.raises(ConfigError, match=r"'throne-4dof': .*throne-1dof, "):
         write_submission(tmp_path, "throne-4dof", seed=0)

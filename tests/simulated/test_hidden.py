@@ -251,7 +251,7 @@ def test_carts_that_run_away_are_refused():
 def test_a_loop_cannot_look_ahead():
     """A drive that leads its log by more than a sample is refused in a loop."""
     assert np.all(np.isfinite(bench(usual("input_delay", delay=-SAMPLE_TIME)).move(control()).x))
-    with pytest.raises(DataError, match="lead its log by more than a sample"):
+    with pytest.raises(DataError, match="lead its log"):
         bench(usual("input_delay", delay=-0.02)).move(control())
 
 
@@ -323,7 +323,7 @@ def test_a_model_too_stiff_to_simulate_is_one_line(command, sizes, tmp_path):
     out = ["--out", str(tmp_path / "out")] if command == "simulate" else []
     done = cartlab_here(command, "--model", str(file), *out)
     assert done.returncode == 2
-    assert "a stiffness is too large, or a mass too small" in done.stderr.splitlines()[-1]
+    assert "stiffness is too" in done.stderr.splitlines()[-1]
     assert list(tmp_path.iterdir()) == [file]
 
 
@@ -389,7 +389,7 @@ def test_a_wrong_effect_is_one_line(hide, message):
 
 def test_one_place_can_have_only_one_dry_friction():
     """Two laws of dry friction cannot be hidden at one place, but at two places they can."""
-    with pytest.raises(ConfigError, match="cart 1 already has coulomb_friction"):
+    with pytest.raises(ConfigError, match=r"cart 1 .*coulomb_friction"):
         prepare_bench(preset="throne-2dof", hide=["coulomb_friction", "stiction"])
     hide = ["coulomb_friction", "stiction:cart=2"]
     assert len(prepare_bench(preset="throne-2dof", hide=hide).effects) == 2

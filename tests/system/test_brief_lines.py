@@ -37,7 +37,8 @@ def test_what_is_left_out_is_counted():
     """The last line says how many items are left out, and where they are."""
     lines = brief_lines(LONG, width=80, most=12, more="the page")
     left = 18 - sum(line.startswith("- Item") for line in lines)
-    assert lines[-1] == f"- {left} more: see the page"
+    assert lines[-1].startswith(f"- {left} more: ")
+    assert lines[-1].endswith("the page")
 
 
 @pytest.mark.slow

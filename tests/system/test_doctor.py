@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from importlib.metadata import version
 
 import pytest
@@ -36,4 +37,4 @@ def test_a_package_that_does_not_load_is_named(tmp_path, monkeypatch):
     done = cartlab("doctor")
 
     assert done.returncode == 1
-    assert "pyyaml: it does not load: ImportError: its library is gone" in done.stdout
+    assert re.search("pyyaml: .*ImportError: .*gone", done.stdout)

@@ -263,7 +263,7 @@ def test_an_unreadable_folder_affects_only_its_row(tmp_path_factory):
         found = {h.id: h for h in find_hand_ins([base / "class"], scratch=base / "scratch")}
         assert sorted(found) == ["folder", "good", "inside", "listed", "toml"]
         assert found["folder"].problem == found["listed"].problem
-        assert found["folder"].problem == "cannot be read (Permission denied)"
+        assert found["folder"].problem.endswith("(Permission denied)")
         assert len({digest(hand_in.sources) for hand_in in found.values()}) >= 3
         for name in ("inside", "toml"):
             with pytest.raises(PermissionError):

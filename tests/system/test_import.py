@@ -242,9 +242,8 @@ def test_a_locked_file_is_imported_once_it_is_free(work, source):
     notes = Notes()
     imported = next(Importer(work, source, observer=notes).watch(once=False, wait=wait))
     assert imported.experiment == "step-1"
-    assert [r for r in notes.remarks if "cannot be read yet (Permission denied)" in r] == [
-        "A.txt: cannot be read yet (Permission denied)"
-    ]
+    (told,) = [r for r in notes.remarks if "Permission denied" in r]
+    assert told.startswith("A.txt: ")
 
 
 def test_the_command_imports_the_files_of_the_folder(work, source):

@@ -135,7 +135,7 @@ def test_an_instruction_waits_for_its_own_answer(state):
     waiting.join()
     assert state.snapshot()["instruction"] is None
     threading.Timer(0.1, state.end).start()
-    with pytest.raises(ConfigError, match=r"nobody .*: let go"):
+    with pytest.raises(ConfigError, match=r"nobody.*: let go"):
         state.confirm("let go")
 
 

@@ -182,7 +182,7 @@ def test_a_row_with_a_decimal_comma_too_many_changes_nothing(tmp_path):
     """A cell beyond the headings is refused with its line, since "0,5" would give 0 points."""
     table = tmp_path / "points.csv"
     table.write_text("submission,laws\nteam-1,0.5\nteam-2,0,5\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"line 3: expected 2 cells, found 3"):
+    with pytest.raises(ConfigError, match=r"line 3: .*found 3"):
         read_wishes(table, why="x")
 
 
@@ -214,10 +214,10 @@ def test_points_come_from_a_table(tmp_path):
     ):
         assert re.search(where, run("override", "--from", table, text=text, status=2))
     table.write_text("submission,discussion,why\nteam-1,good,well done\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"line 2, column discussion: good: "):
+    with pytest.raises(ConfigError, match=r"line 2, .*discussion.*good"):
         read_wishes(table)
     table.write_text("submission,laws\nteam-1,1\nteam-2,1\nteam-1,2\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"line 4: team-1, laws is already in line 2"):
+    with pytest.raises(ConfigError, match=r"line 4: team-1, laws.*2$"):
         read_wishes(table, why="x")
 
 

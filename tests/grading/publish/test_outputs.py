@@ -238,7 +238,7 @@ def test_hiding_a_name_does_not_change_other_words():
     hidden = anonymise(grade, {"3": "anon-a", "step": "anon-b"})
     assert [c.message for c in hidden.criteria] == [c.message for c in grade.criteria]
     assert hidden.flags[0] == grade.flags[0]
-    assert hidden.flags[1].message.startswith("step-1 is also in anon-b: ")
+    assert re.match("step-1 .* anon-b: ", hidden.flags[1].message)
     assert hidden.flags[1].evidence["recordings"][0]["submission"] == "anon-b"
 
 
@@ -307,8 +307,8 @@ def test_feedback_says_why_a_submission_was_not_graded():
     by_hand = with_overrides(fault, {given.criterion: given}, rubric=RUBRIC)
     pages = [fault, stopped, stopped.model_copy(update=adjusted), by_hand]
     texts = [re.sub(r"<[^>]+>", "", feedback_of(grade)) for grade in pages]
-    assert all("o submission.toml in it" in text for text in texts)
-    assert ["hand it in again" in text for text in texts] == [True, False, False, False]
+    assert all("submission.toml in it" in text for text in texts)
+    assert ["hand it in" in text for text in texts] == [True, False, False, False]
     marks = [found and found[0] for text in texts if (found := re.search(r"\d of 20", text)) or 1]
     assert marks == ["0 of 20", None, "5 of 20", "1 of 20"]
     told = json.loads(results_text(new_view(by_hand, RUBRIC)))["output"]
@@ -536,7 +536,7 @@ def test_a_table_of_a_platform_is_read_whatever_its_separators(tmp_path):
         read_table(path)
     for much in ("a\n" * 200_000, "," * 5_000):
         path.write_text(f"a{much}\n", encoding="utf-8")
-        with pytest.raises(ConfigError, match=r"t\.csv: .* 2000 .* 100000"):
+        with pytest.raises(ConfigError, match=r"t\.csv: .*\b2000\b.*\b100000\b"):
             read_table(path)
 
 
