@@ -156,3 +156,12 @@ def test_any_stamps_have_a_clock(steps, still, period, stated):
     fit = fit_stamps(stamps, period=period, stated=stated)
     assert fit.period > 0
     assert fit.missing >= 0
+
+
+@pytest.mark.parametrize("lost", [(), (40,), (40, 41, 200)])
+def test_each_gap_of_a_slow_bench_is_a_lost_line(lost):
+    """With a line every 10 ms, `fit_stamps` counts the lines that are lost, and only those."""
+    stamps = np.delete(10 * np.arange(400, dtype=np.int64), lost)
+    fit = fit_stamps(stamps, period=10.0)
+    assert fit.missing == len(lost)
+    assert fit.period == pytest.approx(10.0)
