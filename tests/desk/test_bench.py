@@ -21,7 +21,7 @@ from pipeline.desk.app import DeskServer
 from pipeline.desk.benches import BenchSession
 from pipeline.experiments.plan import load_plan
 from pipeline.report.exploration import NAME as DIARY
-from pipeline.submission import load_submission
+from pipeline.submission import load_submission, new_submission
 from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.desks import Visitor, a_recorded_cart, at_desk
 from tests.helpers.waiting import PATIENCE, address, kill, until
@@ -271,3 +271,29 @@ def test_only_a_button_that_is_offered_counts_but_stop_always(wish, number, coun
     session: Any = SimpleNamespace(_state=state, _process=SimpleNamespace(send=sent.append))
     assert BenchSession.apply(session, wish, number) == counts
     assert len(sent) == counts
+
+
+def test_the_bench_of_the_folder_s_name_is_offered_first(tmp_path, monkeypatch):
+    """A team whose folder is called as its virtual bench does not record a neighbour's."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "run"))
+    (tmp_path / "run").mkdir()
+    new_submission(work := tmp_path / "team-2", carts=1)
+    code = """
+import sys
+from pipeline.simulated.links import RunningBench, announced
+with announced(RunningBench(name=sys.argv[1], address=sys.argv[2])):
+    print("ready", flush=True)
+    sys.stdin.read()
+"""
+    with ExitStack() as running:
+        for number, name in enumerate(("team-1", "team-2", "team-3"), start=1):
+            command = [sys.executable, "-c", code, name, f"socket://127.0.0.1:{number}"]
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+            bench = running.enter_context(subprocess.Popen(command, **pipes))
+            running.callback(bench.communicate)
+            assert bench.stdout
+            assert bench.stdout.readline()
+        with at_desk(work) as visitor:
+            page = visitor.get("/bench/0/").text
+        listed = re.findall(r'<option value="socket://127.0.0.1:(\d)"', page)
+    assert listed[:3] == ["2", "1", "3"]

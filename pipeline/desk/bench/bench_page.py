@@ -291,15 +291,16 @@ def list_ports(ask: PageRequest) -> list[Port]:
     """Return the ports at which a person may record, the most likely first.
 
     The last port used in this folder comes first if it still exists. Ports with a device follow,
-    and then the virtual benches on this computer. On a lab server, only the ports in the list of
-    users are returned.
+    and then the virtual benches on this computer, first the one with the folder's name. On a lab
+    server, only the ports in the list of users are returned.
     """
-    used = _read_memory().get(str(ask.folder()), "")
+    folder = ask.folder()
+    used = _read_memory().get(str(folder), "")
     if ask.user.owns:
         plugged = [Port(address=name.partition(" (")[0], name=name) for name in port_names()]
         virtual = [
             Port(address=one.address, name=f"virtual bench {one.name} ({one.address})")
-            for one in running_benches()
+            for one in sorted(running_benches(), key=lambda one: one.name != folder.name)
         ]
         # A port about which the system knows nothing seldom has a bench, so it comes last.
         unknown = [port for port in plugged if port.name == port.address]
