@@ -288,8 +288,9 @@ with announced(RunningBench(name=sys.argv[1], address=sys.argv[2])):
     with ExitStack() as running:
         for number, name in enumerate(("team-1", "team-2", "team-3"), start=1):
             command = [sys.executable, "-c", code, name, f"socket://127.0.0.1:{number}"]
-            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-            bench = running.enter_context(subprocess.Popen(command, **pipes))
+            bench = running.enter_context(
+                subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            )
             running.callback(bench.communicate)
             assert bench.stdout
             assert bench.stdout.readline()
