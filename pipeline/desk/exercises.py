@@ -109,8 +109,8 @@ def make_exercises(
         progress(f"exercise {i + 1} of {count}")
         if vary:
             write_team(
-                folder, hidden, percent=vary, key=key_of(root), seed=seed, reported=reported,
-                progress=progress,
+                folder, lambda _: hidden, percent=vary, key=key_of(root), seed=seed,
+                reported=reported, progress=progress,
             )  # fmt: skip
         else:
             write_submission(folder, hidden, seed=seed, reported=reported)
