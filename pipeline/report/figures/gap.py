@@ -257,7 +257,10 @@ def timing_figure(
 
 
 def spectrum_figure(traces: Sequence[Trace], *, position_unit: str, added: str = ADDED) -> Figure:
-    """Return amplitude spectra of the motion and of the models' errors, pooled over runs."""
+    """Return amplitude spectra of the motion and of the models' errors.
+
+    They are root mean squares over the runs, so a sine in each run has a peak of its amplitude.
+    """
     longest = max(float(t.t[-1] - t.t[0]) for t in traces)
     dt = max(float(np.median(np.diff(t.t))) for t in traces)
     f = np.fft.rfftfreq(2 * int(longest / dt), dt)
@@ -271,7 +274,7 @@ def spectrum_figure(traces: Sequence[Trace], *, position_unit: str, added: str =
         ):  # fmt: skip
             even = np.interp(t, trace.t, y)
             spectrum = np.fft.rfft((even - even.mean()) * window, 2 * (f.size - 1))
-            pooled[i] += np.abs(spectrum / window.sum()) ** 2
+            pooled[i] += np.abs(2 * spectrum / window.sum()) ** 2 / len(traces)
     motion, before, after = np.sqrt(pooled)
     total = np.cumsum(motion**2)
     # Show frequencies up to 1.5 times the one below which 99.5 % of the motion lies.
