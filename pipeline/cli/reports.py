@@ -210,11 +210,11 @@ def run_report(
         out = named_folder(out) if out else own
         compared = _comparison(compare, submission)
         with progress_line() as progress:
-            analysis, changes, draft = make_report(
+            analysis, draft = make_report(
                 submission, out, compared=compared, make=second.do, files=files, progress=progress
             )
         if out.resolve() == own.resolve():
-            write_findings(analysis, out, changes=changes, made_of=made_of)
+            write_findings(draft.findings, out, made_of=made_of)
     page = out / "report.html"
     told = [draft.summary, *_unreadable(analysis), *draft.remarks]
     say_briefly("\n".join(told), most=_MOST_LINES, more=str(page))

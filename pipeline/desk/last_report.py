@@ -5,7 +5,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import TypeAdapter
 
@@ -14,10 +14,6 @@ from pipeline.output import write_file
 from pipeline.results import ReportStatus
 from pipeline.submission.load import MAX_NOTES_BYTES, NAME, file_problem, list_experiments
 from pipeline.submission.toml import find_deep_key, read_text
-
-if TYPE_CHECKING:
-    from pipeline.report.changes import DraftChanges
-    from pipeline.results import Analysis, Assumption
 
 # A file next to the report: its questions, assumptions, findings, and state of its sources.
 FINDINGS = "questions.json"
@@ -106,56 +102,17 @@ def read_findings(folder: Path) -> dict[str, Any]:
 
 
 def write_findings(
-    analysis: "Analysis",
-    out: Path,
-    *,
-    changes: "DraftChanges | None",
-    made_of: Mapping[str, Sequence[int]],
+    findings: Mapping[str, Any], out: Path, *, made_of: Mapping[str, Sequence[int]]
 ) -> dict[str, Any]:
     """Write what a report assumed, asked and found wrong next to it; return it.
 
     Parameters
     ----------
-    changes : the differences from an earlier report.
     made_of : the sources, as `stat_sources` found them before they were read.
     """
-    # Imported late, because only a process that has made a report needs them.
-    from pipeline.report.changes import changes_line
-    from pipeline.report.sections.housekeeping import taken_text
-    from pipeline.report.sections.questions import ask
-    from pipeline.words.text import with_symbols
-
-    def describe(one: "Assumption") -> dict[str, Any]:
-        return {
-            "key": one.key,
-            "about": one.about,
-            "value": one.value,
-            "support": one.support,
-            "taken": taken_text(one),
-            "why": with_symbols(one.reason),
-        }
-
-    assumptions = analysis.assumptions
-    findings = {
-        "questions": [
-            {"id": one.id, "section": one.section, "text": with_symbols(one.text)}
-            for one in ask(analysis)
-        ],
-        "assumed": [describe(one) for one in assumptions if one.origin != "stated"],
-        "contradicted": [describe(one) for one in assumptions if one.support == "contradicted"],
-        "changes": with_symbols(changes_line(changes)) if changes else "",
-        "failed": [with_symbols(check.message) for check in analysis.failed_checks],
-        "status": {"state": analysis.status.state, "count": analysis.status.count},
-        "turned": {
-            one.id: 1 if one.input_scale > 0 else -1
-            for one in analysis.records
-            if one.sign_reversed
-        },
-        "unreadable": dict(analysis.unreadable),
-        "made_of": made_of,
-    }
-    write_file(out / FINDINGS, json.dumps(findings, ensure_ascii=False))
-    return findings
+    told = {**findings, "made_of": made_of}
+    write_file(out / FINDINGS, json.dumps(told, ensure_ascii=False))
+    return told
 
 
 def _pick_status(found: object) -> ReportStatus | None:

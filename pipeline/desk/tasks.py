@@ -98,10 +98,10 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
             return None
 
     with lock_or_refuse(out):
-        analysis, changes, _ = write_report(
+        _, draft = write_report(
             submission, out, compared=compared, make=make_draft, progress=progress
         )
-        return write_findings(analysis, out, changes=changes, made_of=made_of)
+        return write_findings(draft.findings, out, made_of=made_of)
 
 
 def make_gap(folder: str, *, progress: Progress) -> None:

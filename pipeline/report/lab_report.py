@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipeline import __version__
 from pipeline.report.builder import Page, Part, remarks
@@ -32,6 +32,7 @@ from pipeline.report.sections.housekeeping import (
     assumption_blocks,
     check_blocks,
     skipped_blocks,
+    taken_text,
 )
 from pipeline.report.sections.loops import feedback_blocks, hardware_blocks
 from pipeline.report.sections.measurements import (
@@ -51,7 +52,7 @@ from pipeline.report.sections.questions import (
     split_notes,
 )
 from pipeline.report.sections.summary import summary, terminal_summary
-from pipeline.results import Analysis
+from pipeline.results import Analysis, Assumption
 from pipeline.words.numbers import count, listing
 from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
@@ -220,7 +221,41 @@ def make_draft(
         files=_make_files(analysis, gap=gap, changes=changes, files=files, progress=progress),
         summary=terminal_summary(analysis),
         remarks=tuple(filter(None, lines)),
+        findings=_findings(analysis, changes),
     )
+
+
+def _findings(analysis: Analysis, changes: DraftChanges | None) -> dict[str, Any]:
+    """Return what a report assumed, asked and found wrong, as JSON for the desk."""
+
+    def describe(one: Assumption) -> dict[str, Any]:
+        return {
+            "key": one.key,
+            "about": one.about,
+            "value": one.value,
+            "support": one.support,
+            "taken": taken_text(one),
+            "why": with_symbols(one.reason),
+        }
+
+    assumptions = analysis.assumptions
+    return {
+        "questions": [
+            {"id": one.id, "section": one.section, "text": with_symbols(one.text)}
+            for one in ask(analysis)
+        ],
+        "assumed": [describe(one) for one in assumptions if one.origin != "stated"],
+        "contradicted": [describe(one) for one in assumptions if one.support == "contradicted"],
+        "changes": with_symbols(changes_line(changes)) if changes else "",
+        "failed": [with_symbols(check.message) for check in analysis.failed_checks],
+        "status": {"state": analysis.status.state, "count": analysis.status.count},
+        "turned": {
+            one.id: 1 if one.input_scale > 0 else -1
+            for one in analysis.records
+            if one.sign_reversed
+        },
+        "unreadable": dict(analysis.unreadable),
+    }
 
 
 def _make_files(

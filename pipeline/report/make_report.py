@@ -1,9 +1,9 @@
 """Write the report of a submission into a folder, for `cartlab report` and for the desk."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipeline.json_files import json_text
 from pipeline.output import clear_files, own_folder, write_file
@@ -47,11 +47,13 @@ class Draft:
     files : contents of the pages and figures.
     summary : what was found, for a terminal.
     remarks : lines on the changes, and on formulas that are not typeset.
+    findings : what the report assumed, asked and found wrong, as JSON for the desk.
     """
 
     files: Made
     summary: str
     remarks: tuple[str, ...]
+    findings: Mapping[str, Any]
 
 
 def make_report(
@@ -62,8 +64,8 @@ def make_report(
     make: Callable[..., Draft],
     files: Files = PAGE_AND_PDF,
     progress: Progress,
-) -> tuple[Analysis, "DraftChanges | None", Draft]:
-    """Analyse a submission and write its report; return the analysis, the changes and the report.
+) -> tuple[Analysis, Draft]:
+    """Analyse a submission and write its report; return the analysis and the report.
 
     Parameters
     ----------
@@ -87,7 +89,7 @@ def make_report(
         )  # imported late, because it loads pandas
 
         save_tables(analysis, out)
-    return analysis, changes, draft
+    return analysis, draft
 
 
 def write_draft(made: Made, out: Path) -> None:

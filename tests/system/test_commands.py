@@ -46,6 +46,17 @@ def test_a_command_loads_only_what_it_needs():
         assert done.stdout.strip() == "set()"
 
 
+def test_only_the_second_process_of_a_report_draws(tmp_path):
+    """The process of `report` itself loads no matplotlib: that would take time twice."""
+    code = (
+        "import sys; from typer.testing import CliRunner; from pipeline.cli import app; "
+        f"done = CliRunner().invoke(app, ['report', {str(EXAMPLES / 'one-cart')!r}, "
+        f"'--out', {str(tmp_path / 'out')!r}]); print(done.exit_code, 'matplotlib' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["0", "False"]
+
+
 def test_report_writes_all_files(tmp_path):
     """For a consistent submission `report --json` writes all files and ends with status 0."""
     out = tmp_path / "out"
