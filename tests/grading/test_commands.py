@@ -15,6 +15,7 @@ import pytest
 
 from pipeline.cli import main
 from pipeline.cli.common import set_encoding
+from pipeline.simulated.submission import write_submission
 from tests.grading.publish.test_survey import write_paper
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.grades import book_of, make_grade, write_class
@@ -35,6 +36,23 @@ def grades(tmp_path_factory) -> Path:
 def points_of(folder: Path, team: str) -> float:
     text = (folder / "feedback" / team / "grade.json").read_text(encoding="utf-8")
     return json.loads(text)["points"]
+
+
+def test_a_class_with_a_submission_that_cannot_be_graded_is_status_one(tmp_path):
+    """The others are graded, and the command names the folder that it could not grade."""
+    write_submission(tmp_path / "class" / "good", "throne-1dof", seed=1, compact=True)
+    spoilt = tmp_path / "class" / "spoilt"
+    spoilt.mkdir()
+    (spoilt / "submission.toml").write_text("[system\n", encoding="utf-8")
+    out = tmp_path / "grades"
+    status, _, err = run("grade", tmp_path / "class", "--rubric", "throne-1dof", "--out", out)
+    assert status == 1
+    assert "spoilt: " in err
+    with (out / "grades.csv").open(encoding="utf-8", newline="") as file:
+        assert {row["submission"]: row["status"] for row in csv.DictReader(file)} == {
+            "good": "graded",
+            "spoilt": "failed",
+        }
 
 
 def test_an_override_reaches_the_pages_at_once(tmp_path):
