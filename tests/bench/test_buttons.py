@@ -71,6 +71,18 @@ def test_stop_ends_the_session_whatever_else_was_pressed(tmp_path, before, real)
     assert load_submission(work).experiments == ()
 
 
+def test_stop_reaches_a_stock_bench(tmp_path):
+    """A bench without extensions gets a stop too, long before its own time is up."""
+    scale = 'input = { unit = "V", per_count = 0.001220703125 }\n'
+    dwell = sine("long", seconds=300, settle=0.3)
+    work = write_work(tmp_path, [dwell], scales=scale, per_count=0.00227)
+    with emulator("--stock", "--speed", "5") as bench:
+        record(work, bench.address, Finger("stop"), "long")
+        while (ended := bench.event("run"))["ended"] == "done":
+            pass
+    assert ended["lines"] < 100_000
+
+
 def test_skip_goes_on_with_the_next(tmp_path, fast):
     """Skip ends the run, saves its data as partial, and asks nothing more about it."""
     work = write_work(tmp_path, [sine("long", seconds=300), sine("next", seconds=1)])
