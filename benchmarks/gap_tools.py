@@ -290,9 +290,10 @@ model whose held-out error is within a tenth of the best.
 _SUMMARY_BETTER = """
 **Others are better** outside this lab: they model systems that are not carts. PySINDy accepts any
 term that you add to its library, and the networks need no idea of the effect. On the real decays
-below, jax-sysid has a smaller error than cartlab. In simulation cartlab has an advantage: its
-catalogue contains every hidden effect. With several carts, some held, the other tools would need
-a model for each arrangement.
+below, cartlab is worst, worse than the linear cart: it names a hidden mass, and the first readings
+do not show how that mass moves. If the start is fitted to the whole record, its error is a fifth
+of the linear cart's. In simulation cartlab has an advantage: its catalogue contains every hidden
+effect. With several carts, some held, the other tools would need a model for each arrangement.
 """
 _SUMMARY_NOTE = """
 Error over the noise: median and quartiles over all benches. "Exactly the effects" counts the

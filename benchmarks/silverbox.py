@@ -143,10 +143,10 @@ several versions of cartlab. No setting was chosen by them.
 
 All tools that ran here learn from the same 30,000 samples. cartlab holds some samples out and
 chooses by them; the others choose by the samples that they learn from. Settings are those of the
-hidden effects above, but every sample is used, because a period has only nine. PySINDy has plain
-differences of order 6 as well as differences smoothed over 5 samples. SysIdentPy has all products
-up to the third degree of 2 and 3 lags, the network 3 and 5 lags. jax-sysid was not run on these
-data.
+[hidden effects](README.md), but every sample is used, because a period has only nine. PySINDy has
+plain differences of order 6 as well as differences smoothed over 5 samples. SysIdentPy has all
+products up to the third degree of 2 and 3 lags, the network 3 and 5 lags. jax-sysid was not run on
+these data.
 
 *Published*: results with the same split and measure, not run here. "Baselines" is M. D.
 Champneys, G. I. Beintema, R. Tóth, M. Schoukens, T. J. Rogers, *Baseline results for selected
