@@ -1,17 +1,16 @@
 """The first page: what a person can do, the state of what is open, and folders to choose from."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from starlette.responses import RedirectResponse, Response
 
-from pipeline.desk.browse import MOST, FolderList, list_folders
+from pipeline.desk.browse import MOST, list_folders
 from pipeline.desk.form_input import read_path
 from pipeline.desk.jobs import Job
 from pipeline.desk.last_report import find_state, read_findings
-from pipeline.desk.navigation import NavLink, list_feedback
+from pipeline.desk.navigation import list_feedback
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.users import Place, User, name_place
 from pipeline.errors import ConfigError, PipelineError
@@ -63,44 +62,6 @@ class OpenClass:
     seen: int
 
 
-@dataclass(frozen=True, kw_only=True)
-class HomePage:
-    """What the first page shows.
-
-    Attributes
-    ----------
-    made : the jobs of the last exercises.
-    start : the folder that is typed in advance.
-    to : the room for which a folder is chosen; "" for any.
-    """
-
-    submissions: Sequence[OpenSubmission]
-    classes: Sequence[OpenClass]
-    made: Sequence[Job]
-    feedback: Sequence[NavLink]
-    start: Path
-    to: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FoldersPage:
-    """The folders to choose from.
-
-    Attributes
-    ----------
-    to : the room for which a folder is chosen; "" for any.
-    """
-
-    folders: FolderList
-    to: str
-    most: int = MOST
-
-    @property
-    def start(self) -> Path:
-        """The folder that is typed in advance."""
-        return self.folders.here.path
-
-
 def show_home(ask: PageRequest) -> Response:
     """Show what a person can do here; a person with only one place is taken to it."""
     user = ask.user
@@ -108,21 +69,29 @@ def show_home(ask: PageRequest) -> Response:
     rooms = [room for room, listed in places.items() for _ in listed]
     if len(rooms) == 1 and not user.owns:
         return RedirectResponse(f"/{rooms[0]}/0/", status_code=303)
-    page = HomePage(
+    return ask.page(
+        "home",
+        title="cartlab",
         submissions=[_describe_submission(ask, n, p) for n, p in enumerate(user.folders)],
         classes=[_describe_class(ask, n, place) for n, place in enumerate(user.gradebooks)],
         made=_list_made(ask),
         feedback=list_feedback(user),
         start=ask.desk.root,
+        to="",
     )
-    return ask.page("home", title="cartlab", page=page)
 
 
 def show_folders(ask: PageRequest) -> Response:
     """Show the list of folders to choose from."""
     to, folders = ask.text("to"), list_folders(ask.desk.root, ask.text("in"))
-    page = FoldersPage(folders=folders, to=to if to in _ROOMS else "")
-    return ask.page("folders", title="Choose a folder", page=page)
+    return ask.page(
+        "folders",
+        title="Choose a folder",
+        folders=folders,
+        to=to if to in _ROOMS else "",
+        start=folders.here.path,
+        most=MOST,
+    )
 
 
 def open_place(ask: PageRequest) -> Response:

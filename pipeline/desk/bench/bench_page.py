@@ -81,36 +81,6 @@ class PlanView:
     recorded: int = 0
 
 
-@dataclass(frozen=True, kw_only=True)
-class BenchPage:
-    """What the page of the bench shows.
-
-    Attributes
-    ----------
-    session : the last session in the folder.
-    asks : whether a session waits for the bench to answer.
-    live : the view of the session while it runs.
-    kind, typed : the kind and the fields of the form for a custom recording.
-    kind_asked : whether the person chose that kind.
-    refused : why the custom recording is not possible.
-    weighed : its predicted benefit.
-    """
-
-    plan: PlanView
-    session: BenchSession | None
-    asks: bool
-    live: str
-    ports: Sequence[Port]
-    has_report: bool
-    diary: bool
-    kind: str
-    kind_asked: bool
-    typed: Mapping[str, str]
-    refused: str
-    weighed: Mapping[str, Any] | None
-    kinds: Sequence[tuple[str, str]] = _KINDS
-
-
 def show(ask: PageRequest) -> Response:
     """Show the plan and the forms, or the current session."""
     return _show_page(ask)
@@ -217,7 +187,10 @@ def _show_page(
     session = ask.desk.benches.of(folder)
     running = session if session and not session.ended.is_set() else None
     kind = typed.get("kind") or ask.query("kind")
-    page = BenchPage(
+    return ask.page(
+        "bench",
+        status=status,
+        title=f"{folder.name} at the bench",
         plan=read_plan(folder, session=session, before=ask.desk.benches.planned.get(folder)),
         session=session,
         asks=running is not None and not running.is_shown,
@@ -229,9 +202,9 @@ def _show_page(
         diary=file_problem(folder, DIARY) is None,
         typed={name: typed.get(name, "") for name in _TYPED},
         refused=refused,
-        weighed=weighed,
+        weighed=weighed,  # the predicted benefit of the typed recording
+        kinds=_KINDS,
     )
-    return ask.page("bench", status=status, title=f"{folder.name} at the bench", page=page)
 
 
 def _note_plan(ask: PageRequest) -> None:

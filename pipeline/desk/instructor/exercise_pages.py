@@ -1,7 +1,6 @@
 """The instructor's room: exercises with hidden effects, solutions, and the catalogue of effects."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -12,87 +11,18 @@ from starlette.responses import RedirectResponse, Response
 from pipeline.desk.browse import free_path
 from pipeline.desk.exercises import SLIDE, key_of
 from pipeline.desk.form_input import keep_refusal, read_path, read_whole_number
-from pipeline.desk.jobs import Job
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
 from pipeline.output import new_folder
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
-from pipeline.plant.effect import Effect
 from pipeline.report.effect_texts import catalogue_data
 from pipeline.simulated.answer_key import MOST_PERCENT
 from pipeline.submission.load import NAME, file_problem
 from pipeline.words.math import to_text
 
 _SHOWN_ON = "throne-2dof"  # the smallest bench with a spring between two carts
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExercisesPage:
-    """The form of an exercise, as filled in.
-
-    Attributes
-    ----------
-    bench : the bench as typed.
-    found : the worker's check of the bench and its effects.
-    shown : each chosen effect, with the address of its picture.
-    wrong : why a field was refused, by name of the field.
-    """
-
-    bench: Mapping[str, str]
-    found: Mapping[str, Any]
-    shown: Sequence[tuple[Mapping[str, Any], str]]
-    out: str
-    folders: str
-    seed: str
-    vary: str
-    reported: bool
-    wrong: Mapping[str, str]
-    presets: Sequence[str] = tuple(sorted(PRESETS))
-    catalogue: Sequence[Effect] = CATALOGUE
-    slide: float = SLIDE
-
-    @property
-    def chosen(self) -> list[str]:
-        """The keys of the chosen effects."""
-        return [effect["key"] for effect, _ in self.shown]
-
-
-@dataclass(frozen=True, kw_only=True)
-class MadePage:
-    """The progress of an exercise, or the exercise when it is finished.
-
-    Attributes
-    ----------
-    made : folder and seed of each finished exercise.
-    sentences : what is hidden, one sentence for each effect.
-    key : the answer key, if every exercise has a bench of its own.
-    files, records : the data files of the first exercise, and its first record of each kind.
-    """
-
-    out: Path
-    job: Job
-    made: Sequence[tuple[Path, int]]
-    bench: Mapping[str, str]
-    key: Path | None = None
-    sentences: Sequence[str] = ()
-    files: Sequence[str] = ()
-    records: Sequence[Mapping[str, Any]] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class SolutionPage:
-    """The page of a solution; `there` says whether there is one."""
-
-    there: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class EffectsPage:
-    """The catalogue of effects, each with its law as text and the address of its picture."""
-
-    entries: Sequence[Mapping[str, Any]]
 
 
 def show(ask: PageRequest) -> Response:
@@ -115,9 +45,13 @@ def _show_form(
     """
     sent = ask.sent
     pictures = [_write_picture_url(bench, one["hide"]) for one in found["effects"]]
-    page = ExercisesPage(
+    return ask.page(
+        "exercises",
+        status=422 if wrong else 200,
+        title="Exercises",
         bench=bench,
         found=found,
+        chosen=[effect["key"] for effect in found["effects"]],
         shown=list(zip(found["effects"], pictures, strict=True)),
         out=str(sent.get("out", free_path(ask.user.workshop or ask.desk.root, "exercise"))),
         folders=str(sent.get("folders", "1")),
@@ -125,8 +59,10 @@ def _show_form(
         vary=str(sent.get("vary", "0")),
         reported=bool(sent.get("reported")),
         wrong=wrong,
+        presets=sorted(PRESETS),
+        catalogue=CATALOGUE,
+        slide=SLIDE,
     )
-    return ask.page("exercises", status=422 if wrong else 200, title="Exercises", page=page)
 
 
 def draw(ask: PageRequest) -> Response:
@@ -180,15 +116,23 @@ def show_made(ask: PageRequest) -> Response:
         for folder, seed in zip(folders, arguments["seeds"], strict=False)
         if (folder / NAME).is_file()
     ]
-    what: Mapping[str, Any] = {}
+    what: Mapping[str, Any] = {"sentences": (), "files": (), "records": ()}
     if job.over and made:
         bench, hide = arguments["bench"], arguments["hide"]
         what = ask.desk.workers.do(
             "describe_exercise", bench=bench, hide=hide, folder=str(made[0][0])
         )
     key = key_of(out) if arguments["vary"] else None
-    page = MadePage(out=out, job=job, made=made, bench=arguments["bench"], key=key, **what)
-    return ask.page("made", title=f"Exercise {out.name}", page=page)
+    return ask.page(
+        "made",
+        title=f"Exercise {out.name}",
+        out=out,
+        job=job,
+        made=made,
+        bench=arguments["bench"],
+        key=key,
+        **what,
+    )
 
 
 def stop(ask: PageRequest) -> Response:
@@ -201,8 +145,8 @@ def stop(ask: PageRequest) -> Response:
 def show_solution(ask: PageRequest) -> Response:
     """Show the solution of a folder, or the progress of making it."""
     folder = ask.folder()
-    page = SolutionPage(there=file_problem(folder, "solution/solution.html") is None)
-    return ask.page("solution", title=f"Solution of {folder.name}", page=page)
+    there = file_problem(folder, "solution/solution.html") is None
+    return ask.page("solution", title=f"Solution of {folder.name}", there=there)
 
 
 def show_catalogue(ask: PageRequest) -> Response:
@@ -216,8 +160,7 @@ def show_catalogue(ask: PageRequest) -> Response:
         }
         for effect, entry in zip(CATALOGUE, catalogue_data(CATALOGUE), strict=True)
     ]
-    page = EffectsPage(entries=entries)
-    return ask.page("effects", title="Effects beyond the linear chain", page=page)
+    return ask.page("effects", title="Effects beyond the linear chain", entries=entries)
 
 
 def _check_exercise(ask: PageRequest) -> tuple[dict[str, str], dict[str, Any]]:

@@ -5,7 +5,7 @@ The editor has a form for the numbers next to the text. A rubric that is not val
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -17,14 +17,12 @@ from pipeline.desk.form_input import keep_refusal, read_path
 from pipeline.desk.grades.grading_form import last_run
 from pipeline.desk.instructor.rubric_form import RubricDraft, make_draft, read_draft
 from pipeline.desk.instructor.rubric_list import (
-    ListedRubric,
     free_name,
     own_rubrics,
     shipped_names,
     shipped_rubrics,
     work_folder,
 )
-from pipeline.desk.jobs import Job
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
 from pipeline.desk.users import Place, name_place
@@ -43,54 +41,7 @@ from pipeline.submission.load import NAME
 _NEW = "new"  # version in a form whose file does not exist yet
 
 
-@dataclass(frozen=True, kw_only=True)
-class RubricListPage:
-    """What the list of rubrics shows: the shipped ones, and those in the instructor's folders."""
-
-    shipped: Sequence[ListedRubric]
-    own: Sequence[ListedRubric]
-
-
 # --------------------------------------------------------------------------- the editor
-
-
-@dataclass(frozen=True, kw_only=True)
-class RubricPage:
-    """What the editor of a rubric shows.
-
-    Attributes
-    ----------
-    file : path of the file, as it was typed if it was refused.
-    refused : why this path was refused, or "".
-    no_students : why no students can be simulated, or "".
-    reference : the folder whose recordings simulated students have.
-    seen : version of the file on which the typed text is based.
-    now : current text of the file, if somebody has changed it since.
-    classes : number and name of each open class.
-    graded : after saving: number and name of each class that the rubric graded, and what was
-        graded last in it.
-    """
-
-    file: Path | str
-    refused: str
-    no_students: str
-    reference: str
-    typed: RubricDraft
-    seen: str
-    now: str | None
-    saved: bool
-    classes: Sequence[tuple[int, str]]
-    graded: Sequence[tuple[int, str, Run | None]]
-
-    @property
-    def is_new(self) -> bool:
-        """Whether the file does not exist yet."""
-        return self.seen == _NEW
-
-    @property
-    def in_words(self) -> str:
-        """The rubric in words; "" while it is not valid."""
-        return rubric_text(self.typed.rubric) if self.typed.rubric else ""
 
 
 def show(ask: PageRequest) -> Response:
@@ -100,8 +51,8 @@ def show(ask: PageRequest) -> Response:
     """
     start = ask.text("start")
     if not start and not ask.text("file"):
-        page = RubricListPage(shipped=shipped_rubrics(), own=own_rubrics(ask.user))
-        return ask.page("rubrics", title="Rubrics", page=page)
+        own = own_rubrics(ask.user)
+        return ask.page("rubrics", title="Rubrics", shipped=shipped_rubrics(), own=own)
     path = _read_rubric_path(ask)
     if path.exists():
         text = rubric_source(path)
@@ -158,19 +109,23 @@ def _show_editor(
     no_students : why no students can be simulated, or "".
     """
     saved = "saved" in ask.request.query_params
-    page = RubricPage(
+    return ask.page(
+        "rubric",
+        status=status,
+        title=Path(path).name or "A rubric",
         file=path,
         refused=ask.user.name_places(refused),
         no_students=ask.user.name_places(no_students),
         reference=ask.text("reference") or next(map(str, ask.user.folders), ""),
         typed=typed,
+        in_words=rubric_text(typed.rubric) if typed.rubric else "",
         seen=version,
+        is_new=version == _NEW,
         now=now,
         saved=saved,
         classes=[(n, name_place(place)) for n, place in enumerate(ask.user.gradebooks)],
         graded=_classes_of(ask, Path(path)) if saved else [],
     )
-    return ask.page("rubric", status=status, title=Path(path).name or "A rubric", page=page)
 
 
 def _classes_of(ask: PageRequest, path: Path) -> list[tuple[int, str, Run | None]]:
@@ -232,58 +187,6 @@ _BARS = re.compile(r"[0-9]{1,5}(\.[0-9]{1,5}){1,49}")  # the bars in an address:
 _ROWS = 30  # rows shown at once; the other rows are folded
 
 
-@dataclass(frozen=True, kw_only=True)
-class RubricPreviewPage:
-    """The data of the preview: the points of a class under a rubric that is not saved yet.
-
-    Attributes
-    ----------
-    text, seen : the typed rubric, and the version of the file on which it is based.
-    number, called : number and name of the class.
-    found : the preview; see `RubricPreview`.
-    teams : all teams, the largest change first.
-    is_of : whether the class was graded by the file of this rubric.
-    titles : the title of each criterion by its id.
-    """
-
-    file: Path
-    text: str
-    seen: str
-    number: int
-    called: str
-    found: Mapping[str, Any]
-    teams: Sequence[Mapping[str, Any]]
-    is_of: bool
-    titles: Mapping[str, str]
-
-    @property
-    def changed(self) -> list[Mapping[str, Any]]:
-        """The teams with any change."""
-        return [one for one in self.teams if one["criteria"] or one["gain"] or one["late"]]
-
-    @property
-    def first(self) -> list[Mapping[str, Any]]:
-        """The changed teams that are shown at once."""
-        return self.changed[:_ROWS]
-
-    @property
-    def rest(self) -> list[Mapping[str, Any]]:
-        """The changed teams that are folded."""
-        return self.changed[_ROWS:]
-
-    @property
-    def means(self) -> list[float]:
-        """The mean of the points before and after."""
-        each = ([team[key] for team in self.teams] for key in ("before", "after"))
-        return [sum(points) / len(points) for points in each]
-
-    @property
-    def drawn(self) -> str:
-        """The bars of both distributions, as the query of an address."""
-        bars = {key: map(str, self.found[f"bars_{key}"]) for key in ("before", "after")}
-        return "&".join(f"{key}={'.'.join(counts)}" for key, counts in bars.items())
-
-
 def preview(ask: PageRequest) -> Response:
     """Show the points of a class under the typed rubric; nothing is saved."""
     path, typed, seen = _read_typed_path(ask), read_draft(ask.form), ask.text("seen")
@@ -293,37 +196,31 @@ def preview(ask: PageRequest) -> Response:
         return _show_editor(ask, path, typed, version=seen, status=422)
     number, place = _find_class(ask)
     found = ask.desk.workers.do("preview_rubric", folder=str(place), text=typed.text)
-    page = RubricPreviewPage(
+    teams = _name_teams(ask, place, found["teams"])
+    points = {key: [team[key] for team in teams] for key in ("before", "after")}
+    changed = [one for one in teams if one["criteria"] or one["gain"] or one["late"]]
+    bars = {key: ".".join(map(str, found[f"bars_{key}"])) for key in points}
+    return ask.page(
+        "rubric_preview",
+        title=f"{path.name}: preview",
         file=path,
         text=typed.text,
         seen=seen,
         number=number,
         called=name_place(place),
         found=found,
-        teams=_name_teams(ask, place, found["teams"]),
+        teams=teams,
+        changed=changed,
+        first=changed[:_ROWS],
+        rest=changed[_ROWS:],
+        means=[sum(of) / len(of) for of in points.values()] if teams else [],
+        drawn=urlencode(bars),
         is_of=found["assignment"] == path.stem,
         titles=typed.rubric.titles,
     )
-    return ask.page("rubric_preview", title=f"{path.name}: preview", page=page)
 
 
 # ----------------------------------------------------------------------- simulated students
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulatedStudentsPage:
-    """The points of simulated students under a rubric that is not saved yet.
-
-    Attributes
-    ----------
-    text, seen : the typed rubric, and the version of the file on which it is based.
-    job : the task; when it is done, its message is the table.
-    """
-
-    file: Path
-    text: str
-    seen: str
-    job: Job
 
 
 def simulate(ask: PageRequest) -> Response:
@@ -359,8 +256,9 @@ def show_simulated(ask: PageRequest) -> Response:
     if job is None or job.task[0] != "simulate_students":
         raise HTTPException(404, "no students were simulated for this rubric")
     text = job.task[1]["text"]
-    page = SimulatedStudentsPage(file=path, text=text, seen=ask.text("seen"), job=job)
-    return ask.page("rubric_simulated", title=f"{path.name}: simulated students", page=page)
+    title = f"{path.name}: simulated students"
+    asked = {"file": path, "text": text, "seen": ask.text("seen"), "job": job}
+    return ask.page("rubric_simulated", title=title, **asked)
 
 
 def draw_preview(ask: PageRequest) -> Response:

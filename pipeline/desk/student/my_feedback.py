@@ -1,7 +1,5 @@
 """A student's own feedback at the desk, and their requests for a review."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from starlette.exceptions import HTTPException
@@ -12,7 +10,7 @@ from pipeline.desk.served_files import show_own_page
 from pipeline.desk.shown_criterion import describe_steps, show_evidence
 from pipeline.desk.users import REFUSED, OwnGrade
 from pipeline.errors import ConfigError
-from pipeline.grading.grade import Criterion, Grade
+from pipeline.grading.grade import Criterion
 from pipeline.grading.gradebook.decisions import MOST_LETTERS, RequestRefused, points_lost
 from pipeline.grading.gradebook.events import Entry
 from pipeline.grading.gradebook.gradebook import Gradebook
@@ -24,45 +22,6 @@ from pipeline.report.document import paragraph
 from pipeline.report.html import render_blocks
 from pipeline.words.numbers import NOTHING
 from pipeline.words.text import capital, rich
-
-
-@dataclass(frozen=True, kw_only=True)
-class FeedbackPage:
-    """What a student sees of their own grade.
-
-    Attributes
-    ----------
-    found, grade : the feedback, and the grade as its students see it; None before its release.
-    lost, kept, waiting : the criteria in which points were lost, those with all points, and those
-        that a person must still grade.
-    waits : what the whole grade waits for; "" if it waits for nothing.
-    hidden : whether computed numbers are hidden.
-    """
-
-    submission: str
-    found: Entry | None = None
-    grade: Grade | None = None
-    lost: Sequence[Mapping[str, Any]] = ()
-    kept: Sequence[Mapping[str, Any]] = ()
-    waiting: Sequence[Mapping[str, Any]] = ()
-    waits: str = ""
-    by_person: Sequence[str] = ()
-    hidden: bool = False
-    most: int = MOST_LETTERS
-
-    @property
-    def n_waiting(self) -> int:
-        """The number of requests without an answer."""
-        return self._count("asked")
-
-    @property
-    def n_answered(self) -> int:
-        """The number of requests with an answer."""
-        return self._count("answered")
-
-    def _count(self, state: str) -> int:
-        requests = self.found.requests.values() if self.found else ()
-        return sum(request.state == state for request in requests)
 
 
 def show(ask: PageRequest) -> Response:
@@ -130,25 +89,31 @@ def _show_page(
 ) -> Response:
     own, found = _find_own(ask), _read(ask)
     if found is None:
-        page = FeedbackPage(submission=own.submission)
-        return ask.page("feedback", status=status, title="Feedback", page=page)
+        shown = {"found": None, "submission": own.submission}
+        return ask.page("feedback", status=status, title="Feedback", **shown)
     seen = view(found, "team", see=ask.user.see)
     grade = seen.grade
     criteria = _describe_criteria(found, seen, refused=refused or {})
     if grade.awaits_grading:
         criteria = []
-    page = FeedbackPage(
+    states = [request.state for request in found.requests.values()]
+    return ask.page(
+        "feedback",
+        status=status,
+        title=found.rubric.title or "Feedback",
         submission=own.submission,
         found=found,
-        grade=grade,
+        grade=grade,  # as its students see it
+        n_waiting=states.count("asked"),
+        n_answered=states.count("answered"),
         waits=waiting_text(grade) if grade.awaits_grading else "",
         lost=[one for one in criteria if one["lost"]],
         kept=[one for one in criteria if not one["lost"] and one["id"] not in grade.open],
         waiting=[one for one in criteria if not one["lost"] and one["id"] in grade.open],
         by_person=seen.person_lines(),
         hidden=seen.hides_numbers,
+        most=MOST_LETTERS,
     )
-    return ask.page("feedback", status=status, title=found.rubric.title or "Feedback", page=page)
 
 
 def _describe_criteria(

@@ -1,7 +1,6 @@
 """What the desk made of a submission: the report and its questions, the plots, and the check."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlencode
 
@@ -10,47 +9,19 @@ from starlette.responses import Response
 from pipeline.desk.last_report import NOTES, PDF, PLOTS, plots_are_current, read_findings
 from pipeline.desk.page_request import Message, PageRequest
 from pipeline.desk.student.form import sign_fields
-from pipeline.desk.student.submission_view import StalePage, SubmissionView, read_room, show_stale
+from pipeline.desk.student.submission_view import SubmissionView, read_room, show_stale
 from pipeline.processes import Failed
 from pipeline.submission.load import NAME, file_problem, list_experiments
 from pipeline.words.numbers import join_names
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReportPage:
-    """The data of the report's page: whether there is a report, and whether it has a PDF."""
-
-    room: SubmissionView
-    there: bool
-    pdf: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class QuestionsPage:
-    """What the page of questions shows.
-
-    Attributes
-    ----------
-    questions : id, section, text, answer, and why the answer was refused, for each question.
-    discussion : text of the discussion, and why it was refused.
-    signs : the signs of the input that one click writes, and their runs; "" for no signs.
-    seen : digest of `notes.md`.
-    """
-
-    room: SubmissionView
-    questions: Sequence[Mapping[str, str]]
-    discussion: tuple[str, str]
-    signs: str
-    problems: Sequence[str]
-    seen: str
 
 
 def show_report(ask: PageRequest) -> Response:
     """Show the report in a window below the steps."""
     folder = ask.folder()
     there = file_problem(folder, "report/report.html") is None
-    page = ReportPage(room=read_room(ask), there=there, pdf=file_problem(folder, PDF) is None)
-    return ask.page("report", title=f"Report of {folder.name}", page=page)
+    pdf = file_problem(folder, PDF) is None
+    title = f"Report of {folder.name}"
+    return ask.page("report", title=title, room=read_room(ask), there=there, pdf=pdf)
 
 
 def show_questions(ask: PageRequest) -> Response:
@@ -88,7 +59,8 @@ def _show_written(
 ) -> Response:
     """Return to the form that wrote into `notes.md`, or show both versions of a changed file."""
     if "stale" in found:
-        return _show_stale(ask, NOTES, found["stale"], changed=[(label, words, "")])
+        changed = [(label, words, "")]
+        return show_stale(ask, NOTES, found["stale"], changed=changed, back=f"{ask.here}questions")
     messages = [Message("Written into notes.md.")]
     messages += [Message(line, "refused") for line in found["as_typed"]]
     return ask.back(f"{ask.here}questions#{place}", *messages, place=place)
@@ -104,7 +76,7 @@ def state_signs(ask: PageRequest) -> Response:
         signs=read_findings(folder)["turned"],
     )
     if "stale" in found:
-        return _show_stale(ask, NAME, found["stale"])
+        return show_stale(ask, NAME, found["stale"], changed=(), back=f"{ask.here}questions")
     if "fault" in found:
         return _show_questions(ask, status=422, sign_error=found["fault"]["text"])
     return ask.back(f"{ask.here}questions#question-sign", "Saved.", place="question-sign")
@@ -142,7 +114,10 @@ def _show_questions(
     for one in [*findings["questions"], *others]:
         words, why = refused.get(one["id"]) or (found["answers"][one["id"]], "")
         questions.append({**one, "answer": words, "wrong": why})
-    page = QuestionsPage(
+    return ask.page(
+        "questions",
+        status=status,
+        title=f"Discussion of {folder.name}",
         room=room,
         questions=questions,
         discussion=discussion or (found["discussion"], ""),
@@ -150,15 +125,6 @@ def _show_questions(
         problems=problems,
         seen=found["seen"],
     )
-    title = f"Discussion of {folder.name}"
-    return ask.page("questions", status=status, title=title, page=page)
-
-
-def _show_stale(
-    ask: PageRequest, name: str, text: str, *, changed: Sequence[tuple[str, str, str]] = ()
-) -> Response:
-    page = StalePage(name=name, text=text, changed=changed, back=f"{ask.here}questions")
-    return show_stale(ask, page)
 
 
 def _list_signs(room: SubmissionView) -> str:
@@ -176,25 +142,6 @@ def _list_signs(room: SubmissionView) -> str:
 _PLOTS = "make_plots"
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlotsPage:
-    """What the page of plots shows.
-
-    Attributes
-    ----------
-    busy : whether a job is running in the folder.
-    plots : address of the plots; "" if they are missing or out of date.
-    again : address of this page, which keeps the chosen recording.
-    failed : whether the last attempt to make the plots failed.
-    """
-
-    room: SubmissionView
-    busy: bool
-    plots: str
-    again: str
-    failed: bool
-
-
 def show_plots(ask: PageRequest) -> Response:
     """Show the plots; if they are missing or out of date, show the job or a button to start it."""
     room, chosen = read_room(ask), _choose(ask)
@@ -205,14 +152,15 @@ def show_plots(ask: PageRequest) -> Response:
     there = not busy and plots_are_current(ask.folder())
     if there and ask.request.headers.get("hx-request"):
         return ask.go(again)  # plots need a page of another width
-    page = PlotsPage(
+    return ask.page(
+        "plots",
+        title=f"Plots of {ask.folder().name}",
         room=room,
         busy=busy,
         plots=f"{ask.here}{PLOTS}{chosen and '#' + chosen}" if there else "",
         again=again,
         failed=job is not None and job.task[0] == _PLOTS and job.state in ("failed", "stopped"),
     )
-    return ask.page("plots", title=f"Plots of {ask.folder().name}", page=page)
 
 
 def make_plots(ask: PageRequest) -> Response:
@@ -237,34 +185,15 @@ def _is_busy(ask: PageRequest) -> bool:
 # -------------------------------------------------------------------------------- the check
 
 
-@dataclass(frozen=True, kw_only=True)
-class CheckPage:
-    """What the page of the check shows: the submission, and `describe_check`."""
-
-    room: SubmissionView
-    busy: bool
-    problems: Sequence[str]
-    ready: bool
-    last: bool
-    result: str
-    rows: Sequence[Mapping[str, Any]]
-    agree: Sequence[str]
-    not_checked: Sequence[str]
-    unread: Sequence[str]
-    doubtful: Sequence[str]
-    asked: str
-
-
 def show_check(ask: PageRequest) -> Response:
     """Show the last answer, and what the student can ask next."""
     folder = ask.folder()
     # Read the job before the answers. If a check ends in between, the page then shows it as running
     # and asks again, instead of showing earlier answers as the result.
-    job = ask.desk.jobs.of(folder)
-    busy = job is not None and not job.over
+    busy = _is_busy(ask)
     found = ask.desk.workers.do("describe_check", folder=str(folder))
-    page = CheckPage(room=read_room(ask), busy=busy, **found)
-    return ask.page("check", title=f"Check of {folder.name}", page=page)
+    title = f"Check of {folder.name}"
+    return ask.page("check", title=title, room=read_room(ask), busy=busy, **found)
 
 
 def begin_check(ask: PageRequest) -> Response:

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -20,62 +20,17 @@ from pipeline.desk.served_files import scratch_folder
 from pipeline.desk.student.files import take_uploads
 from pipeline.desk.student.form import Fault, fill_experiment, fill_form
 from pipeline.desk.student.recording_rows import (
-    FileGroup,
     describe_all,
     gather_remarks,
     group_rows,
 )
-from pipeline.desk.student.submission_view import StalePage, SubmissionView, read_room, show_stale
+from pipeline.desk.student.submission_view import SubmissionView, read_room, show_stale
 from pipeline.desk.toml_form import Field, find_changes, read_value
 from pipeline.processes import Failed
 from pipeline.submission.load import NAME, file_problem, list_experiments, posix
 from pipeline.words.numbers import count, group_messages
 
 _FILES, _SET_UP = "files", "details"  # parts of pages, by their HTML ids
-
-
-@dataclass(frozen=True, kw_only=True)
-class SubmissionPage:
-    """What the page of a submission shows.
-
-    Attributes
-    ----------
-    often : remarks on many files; see `gather_remarks`.
-    not_read : files that are not read, and why; see `tasks.list_not_read`.
-    keeps : why the submission cannot be handed in.
-    gap : whether there is a report on the gap.
-    """
-
-    room: SubmissionView
-    file_groups: Sequence[FileGroup]
-    often: Mapping[str, str]
-    not_read: Sequence[Mapping[str, str]]
-    keeps: Sequence[str]
-    gap: bool
-
-    @property
-    def plotted(self) -> bool:
-        """Whether plots of the recordings can be shown."""
-        return not self.room.facts.check
-
-
-@dataclass(frozen=True, kw_only=True)
-class HandInPage:
-    """What the page of the hand-in shows.
-
-    Attributes
-    ----------
-    files : name and size of each file in the zip, in bytes.
-    """
-
-    room: SubmissionView
-    files: Sequence[tuple[str, int]]
-    authors: Sequence[str]
-
-    @property
-    def has_report(self) -> bool:
-        """Whether the report is in the zip."""
-        return any(name == last_report.PDF for name, _ in self.files)
 
 
 def show(ask: PageRequest) -> Response:
@@ -156,8 +111,14 @@ def show_hand_in(ask: PageRequest) -> Response:
     """Show what is done, what is missing, what was assumed, and the content of the zip."""
     folder, room = ask.folder(), read_room(ask)
     files = [] if room.keeps else _do(ask, "list_hand_in", report=not room.facts.check)
-    page = HandInPage(room=room, files=files, authors=_list_authors(room))
-    return ask.page("handin", title=f"Hand in: {folder.name}", page=page)
+    return ask.page(
+        "handin",
+        title=f"Hand in: {folder.name}",
+        room=room,
+        files=files,  # name and size of each file in the zip, in bytes
+        has_report=any(name == last_report.PDF for name, _ in files),
+        authors=_list_authors(room),
+    )
 
 
 def download_hand_in(ask: PageRequest) -> Response:
@@ -247,15 +208,18 @@ def _show_page(
     """Show the room; fields with errors show what was typed."""
     folder, room = ask.folder(), read_room(ask, changed=changed, fault=fault)
     named = [row.file for row in room.rows if row.index is not None]
-    page = SubmissionPage(
+    return ask.page(
+        "student",
+        status=status,
+        title=folder.name,
         room=room,
         file_groups=group_rows(room.rows),
         often=gather_remarks(room.rows),
         not_read=_do(ask, "list_not_read", named=named),
         keeps=room.keeps if room.facts.is_valid else [],
         gap=file_problem(folder, "gap/gap.html") is None,
+        plotted=not room.facts.check,
     )
-    return ask.page("student", status=status, title=folder.name, page=page)
 
 
 def _edit(
@@ -281,14 +245,14 @@ def _edit(
         now = _do(ask, "read_document", text=found["stale"])
         # If the page is too old, nobody can tell which of its values were typed.
         known = ask.desk.shown(seen, to=ask.user.name) is not None
-        page = StalePage(
-            name=NAME,
-            text=found["stale"],
+        return show_stale(
+            ask,
+            NAME,
+            found["stale"],
             changed=[(field.label, field.value, read_value(now, field)) for field in changed],
             back=ask.here,
             had="You typed" if known else "Your page had",
         )
-        return show_stale(ask, page)
     if "fault" in found:
         return _show_page(ask, status=422, changed=changed, fault=Fault(**found["fault"]))
     return _go_back(ask, [Message("Saved.")], place)

@@ -221,28 +221,26 @@ class SubmissionView:
         return next_step(self.steps)
 
 
-@dataclass(frozen=True, kw_only=True)
-class StalePage:
-    """The data of the page that is shown if a file was changed by others.
+def show_stale(
+    ask: PageRequest,
+    name: str,
+    text: str,
+    *,
+    changed: Sequence[tuple[str, str, str]],
+    back: str,
+    had: str = "You typed",
+) -> Response:
+    """Show both versions of a file that was changed meanwhile.
 
-    Attributes
+    Parameters
     ----------
     name, text : the file as it is now.
     changed : label of each field that the form would change, its typed and its present value.
-    had : heading of the typed values.
     back : address at which to continue.
+    had : heading of the typed values.
     """
-
-    name: str
-    text: str
-    changed: Sequence[tuple[str, str, str]]
-    back: str
-    had: str = "You typed"
-
-
-def show_stale(ask: PageRequest, page: StalePage) -> Response:
-    """Show both versions of a file that was changed meanwhile."""
-    return ask.page("stale", status=409, title=f"{page.name} was changed meanwhile", page=page)
+    shown = {"name": name, "text": text, "changed": changed, "back": back, "had": had}
+    return ask.page("stale", status=409, title=f"{name} was changed meanwhile", **shown)
 
 
 def read_room(
