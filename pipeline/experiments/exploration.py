@@ -429,7 +429,8 @@ class Exploration:
             return [added], WORDS.text("added", name=added.id)
         still, planned = self._planned(recorded=False), list[Recording]()
         for recording in recordings:
-            same = (o for o in still if o.aim == recording.aim and _shape(o) == _shape(recording))
+            named = {"id": recording.id, "note": recording.note}
+            same = (one for one in still if one.model_copy(update=named) == recording)
             planned.append(next(same, None) or propose.add_recording(self.folder, recording))
             still = [one for one in still if one.id != planned[-1].id]
         if planned:
@@ -528,8 +529,3 @@ def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
         converged=True,
     )
     return replace(analysis, fit=fit)
-
-
-def _shape(recording: Recording) -> str:
-    """Return the content of a recording without its name, for comparison."""
-    return recording.model_copy(update={"id": "", "note": "", "aim": ""}).model_dump_json()

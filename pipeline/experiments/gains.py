@@ -235,10 +235,8 @@ class LoopTrial:
             scale=self.scales.input / self.scales.position,
             cart=loop.cart,
         )
-        radius = np.abs(
-            np.linalg.eigvals(_pid_matrix(self.chain, law, period=self.bench.period))
-        ).max()
-        if radius >= 1.0:
+        matrix = sampled_loop.loop_matrix(self.chain, law, sample_time=self.bench.period)
+        if np.abs(np.linalg.eigvals(matrix)).max() >= 1.0:
             raise DataError(
                 f"with kp = {loop.kp:g}, ki = {loop.ki:g}, kd = {loop.kd:g} "
                 f"on cart {loop.cart} the loop is unstable"
@@ -281,22 +279,3 @@ class LoopTrial:
                 f"{self.limits.travel:g}: make the amplitude smaller"
             )
         return motion.t, motion.x
-
-
-def _pid_matrix(chain: Chain, pid: sampled_loop.Pid, *, period: float) -> Array:
-    """Return the matrix that takes (state, ∫e, last e) to the next sample, without reference.
-
-    If ki is zero, the integral is left out: it has no effect, but would add an eigenvalue of 1.
-    """
-    phi, gamma = sampled_loop.discretise(chain, period)
-    row = np.zeros(gamma.size)
-    row[2 * (pid.cart - 1)] = 1.0
-    on_error = pid.kp + pid.ki * period + pid.kd / period
-    effort = pid.scale * np.array([*(-on_error * row), pid.ki, -pid.kd / period])
-    matrix = np.zeros((gamma.size + 2, gamma.size + 2))
-    matrix[:-2, :-2] = phi
-    matrix[:-2] += np.outer(gamma, effort)
-    matrix[-2, :-2], matrix[-2, -2] = -period * row, 1.0
-    matrix[-1, :-2] = -row
-    kept = np.arange(gamma.size + 2) != (gamma.size if pid.ki == 0 else -1)
-    return matrix[np.ix_(kept, kept)]

@@ -399,15 +399,14 @@ def choose_next(
     if not errors[-1] < errors[0]:
         raise DataError(f"no experiment that the limits allow makes {wanted.words} smaller")
     words = _words(wanted, known, after=sums[-1])
-    recordings = tuple(
-        candidates[one].model_copy(
-            update={"aim": wanted.name, "note": _promise(words, before, after)}
-        )
-        for one, before, after in zip(chosen, errors, errors[1:], strict=False)
-    )
+    recordings = []
+    for one, before, after in zip(chosen, errors, errors[1:], strict=False):
+        note = f"{words}: ± {_percent(before)} before, ± {_percent(after)} expected"
+        note += f"; {STATISTICAL}" if after < CALIBRATION else ""
+        recordings.append(candidates[one].model_copy(update={"aim": wanted.name, "note": note}))
     return Choice(
         words=words,
-        recordings=recordings,
+        recordings=tuple(recordings),
         now=float(wanted.of(known.information)),
         errors=tuple(errors.tolist()),
         planned={name: float(wanted.of(known.information + one)) for name, one in still.items()},
@@ -441,12 +440,6 @@ def _words(goal: Goal, known: FisherInformation, *, after: Array) -> str:
     now, then = (names[goal.worst(information)] for information in (known.information, after))
     which = now if now == then else f"now {now}, then {then}"
     return f"{goal.words} ({which})"
-
-
-def _promise(words: str, before: float, after: float) -> str:
-    """Return the predicted benefit of one recording in words, for its note."""
-    doubt = f"; {STATISTICAL}" if after < CALIBRATION else ""
-    return f"{words}: ± {_percent(before)} before, ± {_percent(after)} expected{doubt}"
 
 
 def _percent(share: float) -> str:

@@ -375,10 +375,9 @@ def _in_words(advice: Advice, gap: Gap) -> str:
                 key = "acts_driven" if _is_driven(found.effect) else "acts_free"
             said.append(_WORDS.text(key, Name=capital(found.name)))
     elif advice.difference is None and (advice.aim == "check" or advice.differ_in == "motion"):
-        said += [
-            _WORDS.text("shows_most", Name=capital(found.name), run=_motions(found.effect))
-            for found in effects
-        ]
+        for found in effects:
+            run = phrases("effects").text(f"in_{found.effect.shown_by.replace(' ', '_')}")
+            said.append(_WORDS.text("shows_most", Name=capital(found.name), run=run))
     one, other = side_names(advice.between) if len(advice.between) == 2 else ("", "")
     if advice.aim == "decide" and advice.difference is None and not said:
         said.append(_WORDS.text("either", one=one, other=other))
@@ -405,8 +404,3 @@ def _in_words(advice: Advice, gap: Gap) -> str:
     if advice.repeat:
         said.append(_WORDS.text("repeat_runs"))
     return " ".join(said)
-
-
-def _motions(effect: Effect) -> str:
-    """Return the kind of motions that show an effect best, as a noun phrase."""
-    return phrases("effects").text(f"in_{effect.shown_by.replace(' ', '_')}")

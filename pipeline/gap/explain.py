@@ -4,11 +4,12 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from threading import Condition, Thread
+from threading import Event, local
 from typing import Any
 
 import numpy as np
@@ -54,107 +55,29 @@ from pipeline.words.progress import Progress, silent
 
 @contextmanager
 def two_workers() -> Iterator[Mapper]:
-    """Give a function that maps like the built-in `map`, with this thread and a helper.
+    """Give a function that maps like the built-in `map`, with two threads.
 
-    The first error ends a map. A thread that waits for the other one takes over some of its work.
+    A job that maps does so in its own thread. The first error ends a map.
     """
-    crew = _Crew()
-    helper = Thread(target=crew.help, daemon=True)
-    helper.start()
-    try:
-        yield crew.map
-    finally:
-        crew.close()
-        helper.join()
+    given_up, inside = Event(), local()
 
+    def begin() -> None:
+        inside.worker = True
 
-class _Closed(Exception):
-    """The work is no longer wanted."""
+    def do(work: Callable[..., Any], *job: Any) -> Any:
+        if given_up.is_set():  # after Ctrl-C nobody wants the other thread's work either
+            raise CancelledError
+        return work(*job)
 
+    def mapper(work: Callable[..., Any], *items: Iterable[Any]) -> list[Any]:
+        many = map if hasattr(inside, "worker") else pool.map
+        return list(many(partial(do, work), *items))
 
-class _Map:
-    """One call of the mapper, with the results so far."""
-
-    def __init__(self, work: Callable[..., Any], jobs: list[tuple[Any, ...]]) -> None:
-        self.work, self.jobs = work, jobs
-        self.results: list[Any] = [None] * len(jobs)
-        self.begun = self.ended = 0
-        self.error: BaseException | None = None
-
-    @property
-    def is_open(self) -> bool:
-        """Whether a thread can begin a job."""
-        return self.error is None and self.begun < len(self.jobs)
-
-    @property
-    def is_over(self) -> bool:
-        """Whether no thread has, or can begin, a job."""
-        return self.begun == self.ended and not self.is_open
-
-    def do(self, at: int) -> None:
-        """Do one job."""
+    with ThreadPoolExecutor(2, initializer=begin) as pool:
         try:
-            self.results[at] = self.work(*self.jobs[at])
-        except BaseException as error:
-            self.error = self.error or error
-
-
-class _Crew:
-    """Two threads and their maps; a map that a job opens comes after the job's own map."""
-
-    def __init__(self) -> None:
-        self._maps: list[_Map] = []
-        self._change = Condition()
-        self._closed = False
-
-    def map(self, work: Callable[..., Any], *items: Iterable[Any]) -> list[Any]:
-        """Map like the built-in `map`."""
-        mine = _Map(work, list(zip(*items, strict=False)))
-        with self._change:
-            if self._closed:
-                raise _Closed
-            self._maps.append(mine)
-            self._change.notify_all()
-        try:
-            # Work of an older map could last much longer than this one.
-            self._work(lambda: mine.is_over, lambda: self._maps[self._maps.index(mine) :])
+            yield mapper
         finally:
-            with self._change:
-                self._maps.remove(mine)
-        if mine.error:
-            raise mine.error
-        return mine.results
-
-    def help(self) -> None:
-        """Work until the crew is closed; the oldest map comes first, because its jobs are long."""
-        self._work(lambda: self._closed, lambda: self._maps)
-
-    def close(self) -> None:
-        """Refuse further maps, which ends the helper's work."""
-        with self._change:
-            self._closed = True
-            self._change.notify_all()
-
-    def _work(self, over: Callable[[], bool], maps: Callable[[], list[_Map]]) -> None:
-        while True:
-            with self._change:
-                one = None
-                while not over() and (one := _first_open(maps())) is None:
-                    self._change.wait()
-                if one is None or over():
-                    return
-                at = one.begun
-                one.begun += 1
-            one.do(at)
-            with self._change:
-                one.ended += 1
-                # After Ctrl-C nobody wants the other thread's work either.
-                self._closed |= isinstance(one.error, KeyboardInterrupt)
-                self._change.notify_all()
-
-
-def _first_open(maps: Iterable[_Map]) -> _Map | None:
-    return next((one for one in maps if one.is_open), None)
+            given_up.set()
 
 
 # ----------------------------------------------------------------- compiling in a second process
@@ -272,7 +195,9 @@ def explain_gap(
         progress("fitting the linear chain")
         linear, training = fit_baseline(training, springs=bench.springs, start=chain, mapper=mapper)
         springs = linear.structure.springs
-        notes += _notes_on_springs(bench.springs, springs)
+        stated = zip(spring_names(bench.n), bench.springs, springs, strict=True)
+        missing = [name for name, is_stated, there in stated if is_stated and not there]
+        notes += [phrases("gap").text("note_no_spring", spring=name) for name in missing]
         bench = replace(bench, springs=springs)
         study = Study(
             training=(),
@@ -314,21 +239,22 @@ def _what_to_use(
     """
     interventions = find_interventions(records)
     springs, whole = bench.springs, partial(prepare, springs=bench.springs, notes=[])
-    asked = {one.experiment for one in interventions} | {record.id for record in doubtful}
-    if not asked or not catalogue:
+    suspects: list[tuple[Intervention | Record, str, float, float]] = [
+        *((one, one.experiment, one.start, one.end) for one in interventions),
+        *((one, one.id, float(one.t[0]), float(one.t[-1])) for one in doubtful),
+    ]
+    if not suspects or not catalogue:
         return list(records), interventions
     cut = whole(records, interventions=interventions)
-    uncut = {run.id: run for run in whole([*records, *doubtful]) if run.id in asked}
-    stretches = [one for one in interventions if one.experiment in uncut]
-    others = [record for record in doubtful if record.id in uncut]
-    windows = [(uncut[one.experiment], one.start, one.end) for one in stretches]
-    windows += [(uncut[one.id], float(one.t[0]), float(one.t[-1])) for one in others]
+    uncut = {run.id: run for run in whole([*records, *doubtful])}
+    suspects = [suspect for suspect in suspects if suspect[1] in uncut]
+    windows = [(uncut[name], start, end) for _, name, start, end in suspects]
     chains = [first_chain(cut, springs=springs), *([] if chain is None else [chain])]
     with threadpool_limits(1, user_api="blas"):
         followed_runs = follow(cut, catalogue, map)
         model = start_all(followed_runs, springs=springs, chains=chains)
         told = are_followed(windows, model, followed_runs)
-    known = {id(one) for one, fine in zip((*stretches, *others), told, strict=True) if fine}
+    known = [id(one) for (one, *_), fine in zip(suspects, told, strict=True) if fine]
     used = [*records, *(record for record in doubtful if id(record) in known)]
     return used, tuple(one for one in interventions if id(one) not in known)
 
@@ -375,13 +301,6 @@ def _describe(search: Search, bench: Setup) -> Gap:
         measure_left=measure_left,
         contenders=() if settled else list_contenders(chosen, close or found),
     )
-
-
-def _notes_on_springs(stated: Sequence[bool], there: Sequence[bool]) -> list[str]:
-    """Return a note for each stated spring that the recordings do not show."""
-    names = spring_names(len(stated) - 1)
-    missing = [name for name, a, b in zip(names, stated, there, strict=True) if a and not b]
-    return [phrases("gap").text("note_no_spring", spring=name) for name in missing]
 
 
 def _notes(search: Search, budget: float | None) -> list[str]:

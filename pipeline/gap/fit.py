@@ -89,25 +89,39 @@ class GapFit(GapModel):
         runs; None before the search ends.
     between_runs : the covariance (size, size) that the variation of dry friction adds.
     nuisance : the nuisance parameters of each run, in the order of the runs.
-    cost : sum of squares of residuals in units of the noise, with prior terms.
-    chi_square : the cost without prior terms.
-    n_points : the number of residuals.
-    run_chi : chi-square per residual (runs,) of each run.
-    run_prior : prior terms (runs,) of each run.
-    run_points : number of residuals (runs,) of each run.
+    costs : sum of squares of residuals in units of the noise, and prior terms, (runs, 2).
+    points : number of residuals (runs,) of each run.
     spread : relative standard deviation (n,), from run to run, of each cart's dry friction.
+    inflate : factor on the noise in the prior terms of the `cost`.
     """
 
     nuisance: tuple[Nuisance, ...]
-    cost: float
-    chi_square: float
-    n_points: float
-    run_chi: Array
-    run_prior: Array
-    run_points: Array
+    costs: Array
+    points: Array
     spread: Array
+    inflate: float
     covariance: Array | None = field(default=None)
     between_runs: Array | float = field(default=0.0)
+
+    @property
+    def cost(self) -> float:
+        """The sum of squares of all runs, with prior terms."""
+        return self.chi_square + self.inflate**2 * float(self.costs[:, 1].sum())
+
+    @property
+    def chi_square(self) -> float:
+        """The cost without prior terms."""
+        return float(self.costs[:, 0].sum())
+
+    @property
+    def n_points(self) -> float:
+        """The number of residuals."""
+        return float(self.points.sum())
+
+    @property
+    def run_chi(self) -> Array:
+        """Chi-square per residual (runs,) of each run."""
+        return self.costs[:, 0] / self.points
 
     @property
     def chi(self) -> float:
@@ -167,31 +181,14 @@ def evaluate(
     def cost(pair: tuple[GapRun, Nuisance]) -> tuple[float, float]:
         return run_cost(model, *pair, spread=spread)
 
-    costs = np.array(list(mapper(cost, zip(runs, nuisance, strict=True))))
-    return _fit_at(model, runs, nuisance, costs, spread=spread, inflate=inflate)
-
-
-def _fit_at(
-    model: GapModel,
-    runs: Sequence[GapRun],
-    nuisance: Sequence[Nuisance],
-    costs: Array,
-    *,
-    spread: Array,
-    inflate: float,
-) -> GapFit:
-    points = np.array([residual_points(run) for run in runs])
     return GapFit(
         structure=model.structure,
         theta=model.theta,
         nuisance=tuple(nuisance),
-        cost=float(costs[:, 0].sum() + inflate**2 * costs[:, 1].sum()),
-        chi_square=float(costs[:, 0].sum()),
-        n_points=float(points.sum()),
-        run_chi=costs[:, 0] / points,
-        run_prior=costs[:, 1],
-        run_points=points,
+        costs=np.array(list(mapper(cost, zip(runs, nuisance, strict=True)))),
+        points=np.array([residual_points(run) for run in runs]),
         spread=spread,
+        inflate=inflate,
     )
 
 
@@ -214,8 +211,7 @@ def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
     )
     damp = _DAMP
     for iteration in range(how.iterations):
-        inflate = best.inflation
-        best = replace(best, cost=best.chi_square + inflate**2 * float(best.run_prior.sum()))
+        best = replace(best, inflate=best.inflation)
         linear = _linearise_all(best, runs, how)
         reduced = [part.reduced for part in linear]
         stacked = np.concatenate([*reduced, anchor(runs, reduced[0].shape[1] - 1)])
@@ -298,15 +294,11 @@ def _follow(
         _, moved, cost = min(tried, key=lambda t: t[0])
         return moved, cost
 
-    before = fit.run_chi * fit.run_points + inflate**2 * fit.run_prior
+    before = fit.costs @ [1.0, inflate**2]
     moved = list(how.mapper(move, zip(linear, runs, fit.nuisance, before, strict=True)))
-    return _fit_at(
-        model,
-        runs,
-        [nuisance for nuisance, _ in moved],
-        np.array([cost for _, cost in moved]),
-        spread=fit.spread,
-        inflate=inflate,
+    nuisance, costs = zip(*moved, strict=True)
+    return replace(
+        fit, theta=model.theta, nuisance=nuisance, costs=np.array(costs), inflate=inflate
     )
 
 
@@ -391,7 +383,7 @@ def restart_runs(
             )
 
     nuisance, bad = list(fit.nuisance), np.flatnonzero(worst).tolist()
-    lowest = [chi * residual_points(run) for run, chi in zip(runs, fit.run_chi, strict=True)]
+    lowest = fit.costs[:, 0].tolist()
     trials = [(r, start) for r in bad for start in starts(runs[r], nuisance[r])]
     fits = mapper(again, [runs[r] for r, _ in trials], [start for _, start in trials])
     for (r, _), trial in zip(trials, fits, strict=True):

@@ -393,21 +393,17 @@ def build_up(full: Hypothesis, baseline: Hypothesis, study: Study) -> list[Hypot
         made.append(best)
         return best
 
-    def allowed(option: tuple[Candidate, Any], chosen: Sequence[tuple[Candidate, Any]]) -> bool:
-        mine = option[0]
-        return all(
-            mine.key != other.key
-            and (mine.place, mine.effect.family or mine.key)
-            != (other.place, other.effect.family or other.key)
-            for other, _ in chosen
-        )
+    def slot(option: tuple[Candidate, Any]) -> tuple[int, str | tuple[str, int]]:
+        """Return what only one effect of a model may have: its place, and its family or name."""
+        return option[0].place, option[0].effect.family or option[0].key
 
     alone = sorted(((fitted([option]), option) for option in options), key=lambda one: one[0].error)
     best, first = alone[0]
     chosen = [first]
     ranked = [option for _, option in alone[1:]]
     while not is_enough(best):
-        rest = [option for option in ranked if allowed(option, chosen)][:_TRIED]
+        taken = {slot(option) for option in chosen}
+        rest = [option for option in ranked if slot(option) not in taken][:_TRIED]
         if len(chosen) + 1 >= len(effects) or not rest:
             return [*made, full]
         trials = [(fitted([*chosen, option]), option) for option in rest]
@@ -455,12 +451,11 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
         for few in (order[:_FEW], order[_FEW:]):
             needless = []
             for index in few:
-                plainer = _plainer(chosen, effects[index], study)
-                if plainer is not None:
+                if (plain := effects[index].effect.grows_from) is not None:
+                    plainer = _replaced(chosen, effects[index], find_effect(plain), study)
                     found.append(plainer)
-                    needless += (
-                        [plainer] if plainer.is_credible and plainer.bic < chosen.bic else []
-                    )
+                    if plainer.is_credible and plainer.bic < chosen.bic:
+                        needless.append(plainer)
                 without = found[0]
                 if len(effects) > 1:
                     without = _without(chosen, effects[index], study)
@@ -548,13 +543,6 @@ def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothe
     """Return the hypothesis without one of its effects, refitted from its present values."""
     index = hypothesis.fit.structure.effects.index(effect)
     return judge(fit_on(hypothesis.fit, hypothesis.fit.without(index), study), study)
-
-
-def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis | None:
-    """Return the hypothesis with a rich law replaced by its simpler form, if that form exists."""
-    if rich.effect.grows_from is None:
-        return None
-    return _replaced(hypothesis, rich, find_effect(rich.effect.grows_from), study)
 
 
 def _replaced(hypothesis: Hypothesis, old: Candidate, effect: Effect, study: Study) -> Hypothesis:
@@ -648,13 +636,11 @@ def _stand_ins(
     rival: Hypothesis, chosen: Hypothesis
 ) -> list[tuple[tuple[str, int], tuple[str, int]]]:
     """Return the chosen effects that the rival lacks, each with the rival's substitute."""
-    mine = sorted(chosen.key - rival.key, key=_place)
-    other = sorted(rival.key - chosen.key, key=_place)
+    mine, other = (
+        sorted(keys, key=lambda key: key[::-1])
+        for keys in (chosen.key - rival.key, rival.key - chosen.key)
+    )
     return list(zip(mine, other, strict=True))
-
-
-def _place(key: tuple[str, int]) -> tuple[int, str]:
-    return key[1], key[0]
 
 
 def _same_kind(rival: Hypothesis, chosen: Hypothesis) -> bool:

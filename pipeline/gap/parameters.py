@@ -22,7 +22,14 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.gap.runs import GapRun
 from pipeline.plant.chain import Chain
-from pipeline.plant.effect import AugmentedChain, Effect, EffectTerm, PlaceScales, chain_scales
+from pipeline.plant.effect import (
+    AugmentedChain,
+    Effect,
+    EffectParameter,
+    EffectTerm,
+    PlaceScales,
+    chain_scales,
+)
 from pipeline.plant.simulator import sensitivity
 from pipeline.plant.simulator.kernel import StartState, simulate
 from pipeline.plant.simulator.tables import DRY, Cart, Tables
@@ -127,14 +134,23 @@ class Structure:
         kept = tuple(c for i, c in enumerate(self.effects) if i not in indices)
         return Structure(springs=self.springs, effects=kept)
 
+    @cached_property
+    def parameters(self) -> tuple[tuple[Candidate, EffectParameter, float], ...]:
+        """The effects' parameters in the order of the vector, each with its effect and scale."""
+        return tuple(
+            (c, p, scale)
+            for c in self.effects
+            for p, scale in zip(c.effect.parameters, c.scales, strict=True)
+        )
+
     def friction_direction(self, i: int) -> Array:
         """Return the direction of the vector along which the dry friction of cart i grows."""
-        sizes = [np.zeros(self.base_size)]
-        for c in self.effects:
-            columns = c.effect.columns(dict.fromkeys(c.effect.names, 1.0))
-            mine = c.effect.place == "cart" and c.place == i + 1
-            sizes.append(np.array([float(mine and column in DRY) for column in columns]))
-        return np.concatenate(sizes)
+        grows = [
+            float(c.effect.place == "cart" and c.place == i + 1 and column in DRY)
+            for c in self.effects
+            for column in c.effect.columns(dict.fromkeys(c.effect.names, 1.0))
+        ]
+        return np.array([0.0] * self.base_size + grows)
 
     # ------------------------------------------------------------ the vector
 
@@ -173,52 +189,35 @@ class Structure:
 
     def bounds(self) -> tuple[Array, Array]:
         """Return the lower and upper bounds of the vector."""
-        low, high = [np.full(self.base_size, -np.inf)], [np.full(self.base_size, np.inf)]
-        for c in self.effects:
-            for p, scale in zip(c.effect.parameters, c.scales, strict=True):
-                top = min(p.upper, 1e4)
-                if p.signed:
-                    low.append(np.array([-top]))
-                    high.append(np.array([top]))
-                else:
-                    low.append(np.array([np.log(max(p.lower, _SMALLEST) * scale)]))
-                    high.append(np.array([np.log(top * scale)]))
-        return np.concatenate(low), np.concatenate(high)
+        low, high = [-np.inf] * self.base_size, [np.inf] * self.base_size
+        for _, p, scale in self.parameters:
+            top = min(p.upper, 1e4)
+            low.append(-top if p.signed else np.log(max(p.lower, _SMALLEST) * scale))
+            high.append(top if p.signed else np.log(top * scale))
+        return np.array(low), np.array(high)
 
     def steps(self) -> Array:
         """Return the step of each parameter for finite differences."""
-        steps = [np.full(self.base_size, 1e-4)]
-        for c in self.effects:
-            # Contacts respond irregularly to small changes, so they need larger steps.
-            coarse = 5.0 if c.effect.contact else 1.0
-            steps.append(
-                coarse * np.array([2e-4 if p.signed else 1e-3 for p in c.effect.parameters])
-            )
-        return np.concatenate(steps)
+        # Contacts respond irregularly to small changes, so they need larger steps.
+        own = [
+            (5.0 if c.effect.contact else 1.0) * (2e-4 if p.signed else 1e-3)
+            for c, p, _ in self.parameters
+        ]
+        return np.array([1e-4] * self.base_size + own)
 
     def largest_step(self) -> Array:
         """Return the largest step of each parameter in one iteration."""
-        reach = [np.full(self.base_size, 0.3)]
-        for c in self.effects:
-            reach.append(np.array([1.0 if p.signed else p.reach for p in c.effect.parameters]))
-        return np.concatenate(reach)
+        own = [1.0 if p.signed else p.reach for _, p, _ in self.parameters]
+        return np.array([0.3] * self.base_size + own)
 
     def physical_derivative(self, theta: Array) -> Array:
         """Return d(parameter)/d(coordinate) for the effects' parameters; 1 for the chain's."""
-        out = [np.ones(self.base_size)]
-        for index, c in enumerate(self.effects):
-            values = c.values(theta[self.span(index)])
-            out.append(
-                np.array(
-                    [
-                        scale if p.signed else abs(value)
-                        for p, scale, value in zip(
-                            c.effect.parameters, c.scales, values, strict=True
-                        )
-                    ]
-                )
-            )
-        return np.concatenate(out)
+        values = [value for term in self.model(theta).terms for value in term.values]
+        own = [
+            scale if p.signed else abs(value)
+            for (_, p, scale), value in zip(self.parameters, values, strict=True)
+        ]
+        return np.array([1.0] * self.base_size + own)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

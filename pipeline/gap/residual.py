@@ -93,7 +93,8 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
     for number, one in carts.items():
         measured[number], simulated[number] = one.measured - one.zero, one.final - one.zero
     u = trace.u if cart == 1 else np.zeros(t.size)
-    inputs = np.array([u, _shaped_input(u, model)])
+    drive = model.tables().drive  # its delays and lags are ignored
+    inputs = np.array([u, [shaped_input(drive, float(one)) for one in u]])
     noise = high_frequency_noise(trace.measured - trace.final)
     best = None
     # Lengths of the windows in s; the middle half has most of the weight.
@@ -129,12 +130,6 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
         if noise * windows.gain(model.chain, cart) <= 0.02 * np.ptp(best.measured):
             break
     return best
-
-
-def _shaped_input(u: Array, model: AugmentedChain) -> Array:
-    """Return the input after dead zone and saturation; delays and lags are ignored."""
-    drive = model.tables().drive
-    return np.array([shaped_input(drive, float(one)) for one in u])
 
 
 # ----------------------------------------------------- the force by position, velocity and input
@@ -317,21 +312,21 @@ def find_formula(
     size = np.linalg.norm(columns, axis=0)
     # A term is usable if the other columns do not explain all of it.
     usable = [j for j in range(len(LIBRARY)) if np.linalg.norm(alone[:, j]) > 1e-8 * size[j] > 0]
-    best, lowest = (), _criterion(left, 0)
+    best = _criterion(left, 0), (), np.zeros(0), left
     free = force.size - linear.shape[1]
     # At least ten windows for each term, and at most three terms.
     for count in range(1, min(3, free // 10) + 1):
         for chosen in combinations(usable, count):
             A = alone[:, chosen]
-            rest = left - A @ np.linalg.lstsq(A, left, rcond=None)[0]
-            if (criterion := _criterion(rest, count)) < lowest:
-                best, lowest = chosen, criterion
-    if not best:
+            coefficients = np.linalg.lstsq(A, left, rcond=None)[0]
+            rest = left - A @ coefficients
+            found = _criterion(rest, count), chosen, coefficients, rest
+            best = min(best, found, key=lambda one: one[0])
+    _, chosen, coefficients, rest = best
+    if not chosen:
         return None, np.zeros(force.size)
-    A = alone[:, best]
-    coefficients = np.linalg.lstsq(A, left, rcond=None)[0]
-    rest = left - A @ coefficients
-    variance = float(rest @ rest) / (free - len(best)) * np.diag(np.linalg.inv(A.T @ A))
+    A = alone[:, chosen]
+    variance = float(rest @ rest) / (free - len(chosen)) * np.diag(np.linalg.inv(A.T @ A))
     formula = ForceFormula(
         terms=tuple(
             FormulaTerm(
@@ -340,7 +335,7 @@ def find_formula(
                 std=float(np.sqrt(square)),
                 unit=LIBRARY[j].unit(position=position, drive=drive),
             )
-            for j, coefficient, square in zip(best, coefficients, variance, strict=True)
+            for j, coefficient, square in zip(chosen, coefficients, variance, strict=True)
         ),
         explains=1.0 - float(rest @ rest) / float(left @ left),
     )

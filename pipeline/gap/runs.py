@@ -49,7 +49,6 @@ class GapRun:
     at_rest : whether the carts are at rest at the first sample.
     start_known : whether the start is taken from the first readings, as on a bench without springs.
         Otherwise it is fitted.
-    start, slope : first reading and velocity (n,) of each cart.
     rest : rest positions (n,), as readings.
     zero, zero_std : expected encoder zeros (n,) and their uncertainty; see `with_zeros`.
     sigma : noise (rows,) of one sample.
@@ -71,8 +70,6 @@ class GapRun:
     knots: Array
     command: Array
     at_rest: bool
-    start: Array
-    slope: Array
     rest: Array
     zero: Array
     zero_std: Array
@@ -84,6 +81,16 @@ class GapRun:
     shot_x: Array
     shot_v: Array
     start_known: bool = False
+
+    @property
+    def start(self) -> Array:
+        """The first reading (n,) of each cart."""
+        return self.shot_x[0]
+
+    @property
+    def slope(self) -> Array:
+        """The first velocity (n,) of each cart."""
+        return self.shot_v[0]
 
     @property
     def start_std(self) -> tuple[Array, Array]:
@@ -253,8 +260,6 @@ def make_run(record: Record, *, n: int, part_of: Record | None = None) -> GapRun
         knots=knots,
         command=command,
         at_rest=at_rest,
-        start=start,
-        slope=slope,
         rest=zero,
         zero=zero,
         zero_std=zero_std,
@@ -538,12 +543,10 @@ def _is_usable(record: Record) -> bool:
         return False
     # Without a recorded input, only a release or a run with cart 1 held is usable.
     known = record.u is not None or record.kind == "decay" or 1 not in record.free
-    return known and _moves(record)
-
-
-def _moves(record: Record) -> bool:
-    far = (_span(record, c) > _LEAST_MOTION * record.encoder_step(c) for c in record.measured_free)
-    return any(far)
+    return known and any(
+        _span(record, cart) > _LEAST_MOTION * record.encoder_step(cart)
+        for cart in record.measured_free
+    )
 
 
 def _span(record: Record, cart: int) -> float:
@@ -571,7 +574,8 @@ def split_holdout(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun]
     notes.append(phrases("gap").text("note_cut"))
     longest = max(range(len(runs)), key=lambda i: runs[i].t[-1] - runs[i].t[0])
     run = runs[longest]
-    cut = int((1.0 - 0.4) * _last_motion(run))  # the last 40 % of the motion is held out
+    moving = max(_last_away(run) or run.t.size, run.t.size // 2)
+    cut = int((1.0 - 0.4) * moving)  # the last 40 % of the motion is held out
     pieces, used = [], run.record.part(slice(-run.t.size, None))
     for piece in (slice(0, cut), slice(cut, None)):
         starts = piece.start == 0 and used.kind != "decay"
@@ -593,11 +597,6 @@ def split_holdout(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun]
         )
     others = [r for i, r in enumerate(runs) if i != longest]
     return [*others, pieces[0]], [pieces[1]]
-
-
-def _last_motion(run: GapRun) -> int:
-    """Return the number of samples up to the last motion, but at least half of the run."""
-    return max(_last_away(run) or run.t.size, run.t.size // 2)
 
 
 def _last_away(run: GapRun) -> int:

@@ -97,39 +97,29 @@ def find_offset(
         return None
     if len({run.free for run in runs}) == 1 and not any(run.at_rest for run in runs):
         return None  # the force would look like a wrong encoder zero
-    best: tuple[float, int, float] | None = None
-    total, step = 0.0, 0.0
-    for run, one in zip(runs, nuisance, strict=True):
-        zeros = one.zero[list(run.rows)]
-        total += float(zeros @ zeros)
-        step = max(step, float((run.sigma * np.sqrt(12.0)).max()))
-    count = sum(len(run.rows) for run in runs)
-    if np.sqrt(total / count) < limits.OFFSET_STEPS * step:
+    zeros = [one.zero[list(run.rows)] for run, one in zip(runs, nuisance, strict=True)]
+    total = sum(float(zero @ zero) for zero in zeros)
+    step = max(float((run.sigma * np.sqrt(12.0)).max()) for run in runs)
+    if np.sqrt(total / sum(zero.size for zero in zeros)) < limits.OFFSET_STEPS * step:
         return None
+    found = []
     for cart in range(1, chain.n + 1):
         gains = [_compliance(chain, run, cart) for run in runs]
-        pairs = [
-            (gain, one.zero[list(run.rows)])
-            for gain, run, one in zip(gains, runs, nuisance, strict=True)
-            if np.any(gain)
-        ]
-        forces = np.array([gain @ zero / (gain @ gain) for gain, zero in pairs])
-        if forces.size < 3:
+        pairs = [(gain, zero) for gain, zero in zip(gains, zeros, strict=True) if np.any(gain)]
+        if len(pairs) < 3:
             continue
+        forces = np.array([gain @ zero / (gain @ gain) for gain, zero in pairs])
+        force = float(forces.mean())
         unexplained = total - sum(
-            float(zero @ zero - (zero - gain * forces.mean()) @ (zero - gain * forces.mean()))
+            float(zero @ zero - (zero - gain * force) @ (zero - gain * force))
             for gain, zero in pairs
         )
-        smallest = step / np.sqrt(12.0) / max(float(np.abs(g).max()) for g, _ in pairs)
+        smallest = step / np.sqrt(12.0) / max(float(np.abs(gain).max()) for gain, _ in pairs)
         std = max(float(forces.std(ddof=1)), smallest) / np.sqrt(forces.size)
-        sure = abs(float(forces.mean())) > limits.OFFSET_SURE * std
-        if (
-            sure
-            and unexplained < (1.0 - limits.OFFSET_SHARE) * total
-            and (best is None or unexplained < best[0])
-        ):
-            best = (unexplained, cart, float(forces.mean()))
-    return best[1:] if best else None
+        is_sure = abs(force) > limits.OFFSET_SURE * std
+        if is_sure and unexplained < (1.0 - limits.OFFSET_SHARE) * total:
+            found.append((unexplained, cart, force))
+    return min(found)[1:] if found else None
 
 
 def _compliance(chain: Chain, run: GapRun, cart: int) -> Array:

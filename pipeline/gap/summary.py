@@ -23,7 +23,6 @@ from pipeline.gap.types import (
     Trace,
 )
 from pipeline.plant.catalogue import find_effect
-from pipeline.plant.effect import EffectTerm
 from pipeline.setup import Units
 
 # ------------------------------------------------------------ one simulation over a whole record
@@ -153,7 +152,14 @@ def list_effects(
         # If the cost has many narrow minima, its curvature does not give the standard error.
         rugged = term.effect.contact and final.chi > AT_FLOOR
         known = None if std is None or rugged else std[structure.span(index)]
-        values = _named_values(term, known, units)
+        values = {
+            p.name: NamedValue(
+                value=float(value),
+                std=None if known is None else float(known[i]),
+                unit=p.unit_text(position=units.position, input=units.input),
+            )
+            for i, (p, value) in enumerate(zip(term.effect.parameters, term.values, strict=True))
+        }
         reported = {p.name for p in term.effect.parameters if p.reported}
         out.append(
             FoundEffect(
@@ -201,17 +207,6 @@ def _rival(key: tuple[str, int], hypothesis: Hypothesis, confidence: float) -> A
     return Alternative(
         effect=effect, where=where, nrmse_after=hypothesis.error, confidence=confidence
     )
-
-
-def _named_values(term: EffectTerm, std: np.ndarray | None, units: Units) -> dict[str, NamedValue]:
-    return {
-        p.name: NamedValue(
-            value=float(value),
-            std=None if std is None else float(std[i]),
-            unit=p.unit_text(position=units.position, input=units.input),
-        )
-        for i, (p, value) in enumerate(zip(term.effect.parameters, term.values, strict=True))
-    }
 
 
 def chain_std(fit: GapFit) -> dict[str, float]:

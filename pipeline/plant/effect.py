@@ -13,7 +13,7 @@ from pydantic_core import CoreSchema, core_schema
 from pipeline.arrays import Array
 from pipeline.json_files import computed, result, written
 from pipeline.plant.chain import Chain
-from pipeline.plant.simulator.tables import TABLES, Cart, Drive, Tables, linear_tables
+from pipeline.plant.simulator.tables import TABLES, Tables, linear_tables
 from pipeline.words.math import (
     WIDE_SPACE,
     Math,
@@ -429,15 +429,10 @@ class Effect:
     @property
     def needs_drive(self) -> bool:
         """Whether the law uses the input."""
-        law = self.law
-        text = (
-            law.force
-            if isinstance(law, ForceLaw)
-            else law.size
-            if isinstance(law, FrictionLaw)
-            else ""
-        )
-        return bool({"u", "on"} & names_in(text)) or self.place == "input"
+        match self.law:
+            case ForceLaw(force=text) | FrictionLaw(size=text):
+                return bool({"u", "on"} & names_in(text)) or self.place == "input"
+        return self.place == "input"
 
     def is_built(self, *kinds: str) -> bool:
         """Whether the law is one of the given kinds, which are built into the simulators."""
@@ -504,15 +499,10 @@ class Effect:
 
     def fill(self, tables: Tables, place: int, values: Sequence[float]) -> None:
         """Write this effect into the simulator's tables."""
-        cart, spring, drive = tables
-        columns = self.columns(self.named(values))
-        for column, value in columns.items():
-            if isinstance(column, Drive):
-                drive[column] = value
-            elif isinstance(column, Cart):
-                cart[place - 1, column] = value
-            else:
-                spring[place - 1, column] = value
+        table = dict(zip(TABLES, tables, strict=True))[self.place]
+        row = table if self.place == "input" else table[place - 1]
+        for column, value in self.columns(self.named(values)).items():
+            row[column] = value
 
 
 @result()

@@ -275,26 +275,43 @@ def broken_loop(
     The state is (x, prediction, acting effort). All carts are free, the delay is one tick, nothing
     is clipped or rounded, and the reference is zero.
     """
-    free = tuple(range(1, chain.n + 1))
-    size = 2 * chain.n
-    phi, gamma = discretise(chain, sample_time)
-    model, drive = _prediction(controller, free=free, sample_time=sample_time)
-    reading = np.zeros((size, size))  # how the innovation (x - x_predicted) corrects the state
-    reading[0::2, 0::2] = np.eye(chain.n)
-    reading[1::2, 0::2] = VELOCITY_CORRECTION / sample_time * np.eye(chain.n)
-    predicted = np.hstack([model @ reading, model @ (np.eye(size) - reading), drive[:, None]])
-    moved = np.hstack([phi, np.zeros((size, size + 1))])
-    A = np.vstack([moved, predicted, -controller.gains @ predicted])
-    return A, np.append(gamma, np.zeros(size + 1)), np.append(np.zeros(2 * size), -1.0)
+    A, gamma = _opened(chain, controller, sample_time=sample_time, delay=1)
+    rest = np.zeros(len(A) - gamma.size)
+    return A, np.append(gamma, rest), np.append(np.zeros(len(A) - 1), -1.0)
 
 
-def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) -> Array:
-    """Return the matrix, of size 4n + 1, that maps (x, prediction, acting effort) to the next tick.
+def loop_matrix(chain: Chain, controller: Controller, *, sample_time: float) -> Array:
+    """Return the matrix that maps the loop's state to the next tick.
 
-    The loop is stable if and only if all eigenvalues lie inside the unit circle.
+    The state is (x, prediction, acting effort), (4n + 1,), for state feedback with a delay of one
+    tick, and (x, ∫e, last e) for a PID without delay. The loop is stable if and only if all
+    eigenvalues lie inside the unit circle. Without an integral gain, ∫e has no effect and is left
+    out.
     """
-    A, B, C = broken_loop(chain, controller, sample_time=sample_time)
-    return A - np.outer(B, C)
+    if isinstance(controller, StateFeedback):
+        A, B, C = broken_loop(chain, controller, sample_time=sample_time)
+        return A - np.outer(B, C)
+    A, gamma = _opened(chain, controller, sample_time=sample_time, delay=0)
+    A[: gamma.size] += np.outer(gamma, A[-1])
+    kept = np.delete(np.arange(len(A) - 1), [] if controller.ki else [gamma.size])
+    return A[np.ix_(kept, kept)]
+
+
+def _opened(
+    chain: Chain, controller: Controller, *, sample_time: float, delay: int
+) -> tuple[Array, Array]:
+    """Return the matrix of (x, controller's state, effort) if no effort acts, and Gamma."""
+    phi, gamma = discretise(chain, sample_time)
+    free = tuple(range(1, chain.n + 1))
+    law = _law(controller, free=free, sample_time=sample_time, y0=np.zeros(chain.n), delay=delay)
+    size, own = gamma.size, law.start.size
+    # The law's columns are its state, readings, reference and acting effort.
+    by_state, by_reading, by_effort = np.split(law.moves, [own, own + chain.n], axis=1)
+    A = np.zeros((size + own + 1, size + own + 1))
+    A[:size, :size] = phi
+    A[size:, 0:size:2] = by_reading
+    A[size:, size:-1], A[size:, -1] = by_state, by_effort[:, -1]
+    return A, gamma
 
 
 # ------------------------------------------------------------------- private parts

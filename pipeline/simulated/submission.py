@@ -21,6 +21,7 @@ from pipeline.submission.toml import TypedNumber, Value, toml_section
 
 # ------------------------------------------------------------ the runs of one laboratory session
 
+_TIME_DECIMALS = 5
 INPUT_DECIMALS = 5  # the input is set in steps of 10 µV, so that the log holds the applied input
 FIGURE_FREQUENCY = 4.0  # Hz, the dwell of the paper's Figures 12-14
 
@@ -204,14 +205,11 @@ class Students:
     title : title of the submission. By default it names the bench and the seed.
     springs : whether they declare each spring as present. By default, they state the true springs.
     is_anonymous : whether nobody is named; the students then enter themselves.
-    time_decimals : decimals of the log's time stamps. With 3, they are rounded as in an ECP export.
     """
 
     authors: Sequence[str] = ()
     title: str = ""
-    section: str = "01"
     springs: Sequence[bool] = ()
-    time_decimals: int = 5
     is_anonymous: bool = False
 
 
@@ -253,9 +251,7 @@ def write_submission(
     for run in programme:
         motion = bench.move(run)
         y = bench.read(motion, run=run, rng=rng)
-        logs[_data_file(run)] = _csv_text(
-            run, motion, y, time_decimals=students.time_decimals, count=bench.count
-        )
+        logs[_data_file(run)] = _csv_text(run, motion, y, count=bench.count)
     sections = [
         *_head(bench, students, seed=seed),
         toml_section("[design]", task.model_dump()),
@@ -317,7 +313,7 @@ def _head(bench: SimulatedBench, students: Students, *, seed: int) -> Iterator[s
     """Yield the tables that come before the experiments."""
     named = f"Simulated bench, {bench.name}, seed {seed}" if bench.name else "Simulated bench"
     title = students.title or named
-    yield toml_section("", {"version": 1, "title": title, "section": students.section})
+    yield toml_section("", {"version": 1, "title": title, "section": "01"})
     nobody = () if students.is_anonymous else (f"s{1001 + 2 * seed}", f"s{1002 + 2 * seed}")
     for author in students.authors or nobody:
         yield toml_section("[[authors]]", {"id": author})
@@ -340,16 +336,14 @@ def _design(believed: Chain, task: Design) -> FeedbackDesign:
     )
 
 
-def _csv_text(
-    run: BenchRun, motion: TrueMotion, y: Array, *, time_decimals: int, count: float
-) -> str:
+def _csv_text(run: BenchRun, motion: TrueMotion, y: Array, *, count: float) -> str:
     """Return the log of one run: time, input, reference (in a closed loop), and x1 … xn.
 
     `y` (n_carts, n) holds whole counts in position units. They are written with one digit more than
     is needed to distinguish counts.
     """
     kept = run.t >= run.keep_from
-    columns = {"time": _fixed(run.t[kept] - run.t[kept][0], time_decimals)}
+    columns = {"time": _fixed(run.t[kept] - run.t[kept][0], _TIME_DECIMALS)}
     columns["input"] = _fixed(motion.u[kept], INPUT_DECIMALS)
     if run.reference is not None:
         columns["reference"] = _fixed(run.reference[kept], INPUT_DECIMALS)

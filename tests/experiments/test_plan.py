@@ -18,7 +18,6 @@ from pipeline.experiments.plan import (
     plan_path,
     plan_text,
     save_plan,
-    session_time,
 )
 from pipeline.experiments.propose import (
     AIM,
@@ -431,18 +430,3 @@ def test_the_command_writes_shows_and_extends(tmp_path):
     assert data["seconds_left"] == pytest.approx(119.0)
     assert "0 recordings" in again.stderr
     assert (tmp_path / "bench" / "plan.toml").read_bytes() == raw
-
-
-def test_the_time_of_a_session_includes_the_rests():
-    """The `session_time` is that of all recordings and of the rests before them."""
-    run = Recording(
-        id="a",
-        kind="sine",
-        carts=(1,),
-        wave="sine",
-        amplitude=0.1,
-        frequency=2.0,
-        cycles=8,
-        settle=3,
-    )
-    assert session_time([run, run.model_copy(update={"settle": 0.5})]) == 2 * 4.0 + 3.5

@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 from pipeline.gap.fit import GapFit, fit_baseline
-from pipeline.gap.judge import Study
+from pipeline.gap.judge import Study, make_candidate
+from pipeline.gap.parameters import GapModel
 from pipeline.gap.runs import make_run, split
-from pipeline.plant.catalogue import CATALOGUE
+from pipeline.plant.catalogue import CATALOGUE, find_effect
 from tests.truth.bench import Hidden
 from tests.truth.cases import make_case
 
@@ -26,3 +27,14 @@ def begun(*hidden: Hidden, rate: float = 113.1) -> tuple[GapFit, Study]:
         catalogue=CATALOGUE,
     )
     return fit, study
+
+
+def with_effects(
+    model: GapModel, study: Study, *effects: tuple[tuple[str, int], tuple[float, ...]]
+) -> GapModel:
+    """Return a model with further effects, each with its name, place and values."""
+    chain = model.structure.chain(model.theta)
+    for (key, place), values in effects:
+        effect = make_candidate(find_effect(key), place, values, runs=study.training, chain=chain)
+        model = model.with_effect(effect, values)
+    return model

@@ -8,15 +8,14 @@ import pytest
 from pipeline.estimation.force_balance import find_interventions
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit import evaluate, restart_runs
-from pipeline.gap.judge import build_up, fit_free_run, judge, make_candidate
+from pipeline.gap.judge import build_up, fit_free_run, judge
 from pipeline.gap.pem.fit import start_all
 from pipeline.gap.runs import make_run, split_holdout
 from pipeline.gap.search import OutOfTime, are_followed, find_hypotheses, follow
 from pipeline.gap.summary import repeatability
-from pipeline.plant.catalogue import find_effect
 from pipeline.results import Record
 from pipeline.setup import Setup
-from tests.gap.begun import begun
+from tests.gap.begun import begun, with_effects
 from tests.truth.bench import Hidden, simulate_truth
 from tests.truth.cases import COUNT, make_case
 
@@ -222,16 +221,12 @@ def test_a_law_alone_takes_the_place_of_its_crutches():
     fit, study = begun(LAG, rate=200.0)
     baseline, chain = judge(fit, study), fit.structure.chain(fit.theta)
     stiff = float(chain.k.sum())
-    crutches = {
-        "actuator_lag": (0.0295,),
-        "input_delay": (0.0005,),
-        "extra_mode": (0.1 * float(chain.m[0]), 3.0 * stiff, 0.1 * float(chain.c[0])),
-    }
-    model = fit.without_nuisance
-    for key, values in crutches.items():
-        place = 1 if key == "extra_mode" else 0
-        effect = make_candidate(find_effect(key), place, values, runs=study.training, chain=chain)
-        model = model.with_effect(effect, values)
+    crutches = [
+        (("actuator_lag", 0), (0.0295,)),
+        (("input_delay", 0), (0.0005,)),
+        (("extra_mode", 1), (0.1 * float(chain.m[0]), 3.0 * stiff, 0.1 * float(chain.c[0]))),
+    ]
+    model = with_effects(fit.without_nuisance, study, *crutches)
     full = judge(fit_free_run(model, study), study)
     assert len(full.key) == 3
 
@@ -247,9 +242,8 @@ def test_a_single_held_out_run_is_restarted_at_another_rest():
     """With cogging a cart may rest in several places; a run at the wrong one is restarted."""
     values = {"force": 0.002, "pitch": 0.3, "phase": 0.5}
     fit, study = begun(Hidden(effect="cogging", parameters=values), rate=200.0)
-    chain, numbers = fit.structure.chain(fit.theta), tuple(values.values())
-    effect = make_candidate(find_effect("cogging"), 0, numbers, runs=study.training, chain=chain)
-    model = fit.without_nuisance.with_effect(effect, numbers)
+    cogging = ("cogging", 0), tuple(values.values())
+    model = with_effects(fit.without_nuisance, study, cogging)
     found = judge(fit_free_run(model, study), study)
     at, step = next((i, run) for i, run in enumerate(study.held_out) if run.at_rest)
     own = found.held.nuisance[at]

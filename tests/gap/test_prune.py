@@ -5,17 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.gap.judge import (
-    SURE,
-    enrich,
-    fit_free_run,
-    judge,
-    make_candidate,
-    prune,
-    significance,
-)
-from pipeline.plant.catalogue import find_effect
-from tests.gap.begun import COULOMB, DAHL, DELAY, begun
+from pipeline.gap.judge import SURE, enrich, fit_free_run, judge, prune, significance
+from tests.gap.begun import COULOMB, DAHL, DELAY, begun, with_effects
 from tests.truth.bench import Hidden
 
 
@@ -25,13 +16,7 @@ def test_a_richer_law_that_explains_no_more_is_replaced():
         Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0006}),
         Hidden(effect="input_delay", parameters={"delay": 0.015}),
     )
-    chain = fit.structure.chain(fit.theta)
-    start = fit
-    for key, values in (("input_delay", (0.015,)), ("presliding_friction", (0.0006, 1e-4))):
-        effect = find_effect(key)
-        place = 0 if effect.place == "input" else 1
-        candidate = make_candidate(effect, place, values, runs=study.training, chain=chain)
-        start = start.with_effect(candidate, values)
+    start = with_effects(fit, study, (DELAY, (0.015,)), (DAHL, (0.0006, 1e-4)))
     rich = judge(fit_free_run(start, study), study)
 
     pruned = prune(rich, study, [judge(fit, study)])
@@ -51,10 +36,8 @@ def test_a_richer_law_that_explains_no_more_is_replaced():
 def test_a_plain_law_becomes_a_richer_one_only_if_that_is_true(effect, parameters, key):
     """Dry friction becomes presliding friction if the cart's friction builds up over a distance."""
     fit, study = begun(Hidden(effect=effect, place=1, parameters=parameters))
-    chain = fit.structure.chain(fit.theta)
-    dry = find_effect("coulomb_friction")
-    candidate = make_candidate(dry, 1, (0.0006,), runs=study.training, chain=chain)
-    plain = judge(fit_free_run(fit.with_effect(candidate, (0.0006,)), study), study)
+    plain = with_effects(fit, study, (COULOMB, (0.0006,)))
+    plain = judge(fit_free_run(plain, study), study)
 
     rich = enrich(plain, study, found=[])
 
@@ -66,13 +49,9 @@ def test_a_plain_law_becomes_a_richer_one_only_if_that_is_true(effect, parameter
 def test_an_effect_of_zero_within_its_error_is_not_significant(value, nothing):
     """With a standard error of 1 ms, a delay of 15 ms is significant, and one of 0.1 ms is not."""
     fit, study = begun(Hidden(effect="input_delay", parameters={"delay": 0.015}))
-    chain = fit.structure.chain(fit.theta)
-    delay = make_candidate(
-        find_effect("input_delay"), 0, (value,), runs=study.training, chain=chain
-    )
-    model = fit.with_effect(delay, (value,))
+    model = with_effects(fit, study, (DELAY, (value,)))
     known = replace(fit, structure=model.structure, theta=model.theta)
-    sure = np.diag(np.full(model.theta.size, (1e-3 / delay.scales[0]) ** 2))
+    sure = np.diag(np.full(model.theta.size, (1e-3 / model.structure.effects[0].scales[0]) ** 2))
 
     (found,) = significance(replace(known, covariance=sure))
     assert (found < SURE) == nothing
@@ -83,10 +62,7 @@ def test_an_effect_of_zero_within_its_error_is_not_significant(value, nothing):
 def test_a_sensor_gain_is_significant_by_its_distance_from_one(gain, nothing):
     """With a standard error of 0.01, only a gain far from 1 is significant."""
     fit, study = begun()
-    chain = fit.structure.chain(fit.theta)
-    effect = find_effect("sensor_gain")
-    sensor = make_candidate(effect, 1, (gain,), runs=study.training, chain=chain)
-    model = fit.with_effect(sensor, (gain,))
+    model = with_effects(fit, study, (("sensor_gain", 1), (gain,)))
     known = replace(fit, structure=model.structure, theta=model.theta)
     by_theta = known.structure.physical_derivative(known.theta)
     sure = np.diag((0.01 / np.where(by_theta == 0, 1.0, by_theta)) ** 2)

@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.gap.search import Deadline, Search
+from pipeline.gap.judge import judge
+from pipeline.gap.search import Deadline, Search, find_hypotheses
+from pipeline.gap.summary import find_windows
 from tests.gap.begun import COULOMB, DELAY, begun
 from tests.truth.bench import Hidden
 
@@ -65,3 +67,29 @@ def test_overestimated_noise_is_measured_again():
 
     assert search.study.floor == pytest.approx(study.floor, rel=0.1)
     assert search.chosen.fit.chi > 0.7
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_friction_below_the_noise_floor_is_not_named():
+    """Friction that changes no error is no effect, if a delay alone leaves only noise."""
+    fit, study = begun(
+        Hidden(effect="coulomb_friction", place=1, parameters={"force": 2.4e-6}),
+        Hidden(effect="input_delay", parameters={"delay": 0.014}),
+        rate=884.7,
+    )
+    chosen, _ = find_hypotheses(judge(fit, study), study)
+    assert chosen.key == {DELAY}
+    assert chosen.at_floor
+
+
+def test_the_gap_is_located_on_its_cart_and_in_its_recording():
+    """The windows of the only cart of a bench are its own, and lie within their recordings."""
+    fit, study = begun(FRICTION)
+    windows = find_windows(fit, study.training)
+    spans = {run.id: (run.t[0], run.t[-1]) for run in study.training}
+    assert {window.cart for window in windows} == {1}
+    for window in windows:
+        first, last = spans[window.experiment]
+        assert first <= window.start < window.end <= last
+        assert 0.15 < window.share <= 1.0
