@@ -6,6 +6,7 @@ To add an effect: write an `Effect` here, list it in `CATALOGUE`, and run
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from difflib import get_close_matches
 from math import inf
 from operator import attrgetter
@@ -32,6 +33,17 @@ LEAST_SLIDING = 0.01  # share of the friction at rest; any dry surface has more 
 FORCE = EffectParameter(
     "force", "F", "input", scale="stiffness * position", typical=0.012, neutral=0.0
 )
+
+
+def _coefficient(
+    symbol: str, unit: str, *, scale: str, typical: float, signed: bool = False
+) -> EffectParameter:
+    """Return the parameter of a law that is proportional to it."""
+    return EffectParameter(
+        "coefficient", symbol, unit, scale=scale, typical=typical, signed=signed, neutral=0.0
+    )
+
+
 COULOMB_FRICTION = Effect(
     key="coulomb_friction",
     title="Dry (Coulomb) friction",
@@ -108,7 +120,7 @@ LOAD_FRICTION = Effect(
     sentence="The harder the motor pushes, the more the bearing or rack grips.",
     place="cart",
     law=FrictionLaw("μ * abs(u)"),
-    parameters=(EffectParameter("coefficient", "μ", "", scale="1", typical=0.03, neutral=0.0),),
+    parameters=(_coefficient("μ", "", scale="1", typical=0.03),),
     fingerprint="While the motor pushes, there is more dry friction than in a free decay.",
     deciding_run="Steps of two sizes: doubling the input doubles the added friction.",
     shown_by="driven motions",
@@ -124,14 +136,7 @@ QUADRATIC_DRAG = Effect(
     place="cart",
     law=ForceLaw("-q * v * abs(v)"),
     parameters=(
-        EffectParameter(
-            "coefficient",
-            "q",
-            "input s^2/position^2",
-            scale="damping / velocity",
-            typical=1.0,
-            neutral=0.0,
-        ),
+        _coefficient("q", "input s^2/position^2", scale="damping / velocity", typical=1.0),
     ),
     fingerprint="Large swings decay faster than small ones.",
     deciding_run="Free decays from two release distances: the fitted ζ is larger for the larger "
@@ -148,17 +153,7 @@ FORCE_OFFSET = Effect(
     sentence="The track is tilted, or the motor pushes even at zero input.",
     place="cart",
     law=ForceLaw("F"),
-    parameters=(
-        EffectParameter(
-            "force",
-            "F",
-            "input",
-            scale="stiffness * position",
-            typical=0.03,
-            signed=True,
-            neutral=0.0,
-        ),
-    ),
+    parameters=(replace(FORCE, typical=0.03, signed=True),),
     fingerprint="In every recording the cart rests off zero, as if pushed by the same force.",
     deciding_run="Recordings with different carts held: the stiffer the springs on the cart, the "
     "less a force displaces it. A wrong encoder zero shifts the reading equally in all recordings.",
@@ -177,14 +172,8 @@ CUBIC_SPRING = Effect(
     place="spring",
     law=ForceLaw("a * d**3"),
     parameters=(
-        EffectParameter(
-            "coefficient",
-            "a",
-            "input/position^3",
-            scale="stiffness / position**2",
-            typical=0.2,
-            signed=True,
-            neutral=0.0,
+        _coefficient(
+            "a", "input/position^3", scale="stiffness / position**2", typical=0.2, signed=True
         ),
     ),
     fingerprint="The frequency depends on the amplitude, and the static gain depends on the size "
@@ -205,14 +194,8 @@ ASYMMETRIC_SPRING = Effect(
     place="spring",
     law=ForceLaw("b * d**2"),
     parameters=(
-        EffectParameter(
-            "coefficient",
-            "b",
-            "input/position^2",
-            scale="stiffness / position",
-            typical=0.2,
-            signed=True,
-            neutral=0.0,
+        _coefficient(
+            "b", "input/position^2", scale="stiffness / position", typical=0.2, signed=True
         ),
     ),
     fingerprint="The swings are longer to one side than to the other, and the centre of a large "
@@ -263,11 +246,7 @@ COUPLING_DAMPER = Effect(
     sentence="A spring, hose or cable between two carts damps changes in its length.",
     place="spring",
     law=ForceLaw("c * rate", step=inf),
-    parameters=(
-        EffectParameter(
-            "coefficient", "c", "input s/position", scale="damping", typical=0.3, neutral=0.0
-        ),
-    ),
+    parameters=(_coefficient("c", "input s/position", scale="damping", typical=0.3),),
     fingerprint="Modes in which the carts move against each other are damped more than the others.",
     deciding_run="A free decay of each mode: compare their damping.",
     shown_by="held carts",
@@ -284,17 +263,7 @@ DRIVE_DAMPING = Effect(
     sentence="The motor brakes cart 1 while the input is on, but not while it is zero.",
     place="input",
     law=ForceLaw("-c * v * on", step=inf),
-    parameters=(
-        EffectParameter(
-            "coefficient",
-            "c",
-            "input s/position",
-            scale="damping",
-            typical=0.2,
-            signed=True,
-            neutral=0.0,
-        ),
-    ),
+    parameters=(_coefficient("c", "input s/position", scale="damping", typical=0.2, signed=True),),
     fingerprint="The cart is damped more after the input steps on than after it steps off.",
     deciding_run="Steps of two sizes and a free decay: compared with the decay, both steps add the "
     "same damping.",
@@ -456,9 +425,7 @@ COGGING = Effect(
     law=ForceLaw("F * sin(2 * π * x / λ + φ)", on_motor=True, step=1e-3),
     growth=FitCoordinates(("a", "b", "λ"), {"F": "hypot(a, b)", "φ": "atan2(b, a)"}, signed=True),
     parameters=(
-        EffectParameter(
-            "force", "F", "input", scale="stiffness * position", typical=0.01, neutral=0.0
-        ),
+        replace(FORCE, typical=0.01),
         EffectParameter(
             "pitch",
             "λ",

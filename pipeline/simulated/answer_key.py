@@ -4,7 +4,6 @@ The draw depends on a secret in the key, so that nobody can repeat it without th
 """
 
 import hashlib
-import json
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,10 +12,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from pipeline.errors import ConfigError, DataError
-from pipeline.json_files import json_text, result, written
+from pipeline.json_files import json_text, read_json, result, written
 from pipeline.lock import lock_when_free
 from pipeline.output import write_file
 from pipeline.plant.chain import Chain
@@ -97,10 +95,10 @@ def read_key(path: Path) -> AnswerKey:
     ------
     ConfigError : the file is not an answer key.
     """
+    text = read_text(path, where=str(path), limit=_MOST_BYTES, error=ConfigError)
     try:
-        found = json.loads(read_text(path, where=str(path), limit=_MOST_BYTES, error=ConfigError))
-        return TypeAdapter(AnswerKey).validate_python(found)
-    except (ValidationError, ValueError, RecursionError):
+        return read_json(AnswerKey, text)
+    except (ValueError, KeyError, TypeError):
         raise ConfigError(
             f"{path}: is not an answer key; give the file that an earlier `simulate --vary` "
             "wrote, or a new one"

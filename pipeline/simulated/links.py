@@ -230,7 +230,8 @@ def announced(bench: RunningBench) -> Iterator[None]:
     with suppress(OSError):  # without a folder, the bench's address can still be typed
         folder.mkdir(OWNERS_FOLDER, exist_ok=True)
         if _is_own(folder):
-            _clear_stale(folder)
+            for stale in (other for other in folder.glob("*.json") if _read(other) is None):
+                stale.unlink(missing_ok=True)
             path.write_text(json.dumps(entry), encoding="utf-8")
     try:
         yield
@@ -283,9 +284,3 @@ def _began(pid: int) -> float:
         return psutil.Process(pid).create_time()
     except psutil.Error:
         return 0.0
-
-
-def _clear_stale(folder: Path) -> None:
-    for path in folder.glob("*.json"):
-        if _read(path) is None:
-            path.unlink(missing_ok=True)

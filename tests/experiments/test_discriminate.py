@@ -22,7 +22,6 @@ from pipeline.gap.types import AlternativeModel, Gap, Trace, read_gap
 from pipeline.ingest.read import read_data
 from pipeline.json_files import json_text
 from pipeline.plant.augmented import simulate_augmented
-from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import Chain
 from pipeline.plant.effect import AugmentedChain
 from pipeline.report.gap_report import build_gap_document
@@ -35,7 +34,7 @@ from pipeline.submission import Submission, load_submission
 from pipeline.words.progress import silent
 from pipeline.workflow import analyse
 from tests.helpers.commandline import cartlab_here
-from tests.helpers.effects import make_term
+from tests.helpers.effects import model_with
 from tests.helpers.gaps import make_gap, two_cart_analysis
 from tests.helpers.virtual import VirtualBench, VirtualSession
 
@@ -44,14 +43,9 @@ LIMITS = PlanLimits(input=0.5, travel=2.5)
 CHAIN = Chain(m=np.array([3e-4, 1.8e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.0, 0.127, 0.061]))
 
 
-def model(key: str, *, place: int, **values: float) -> AugmentedChain:
-    term = make_term(find_effect(key), place=place, values=values, chain=CHAIN)
-    return AugmentedChain(chain=CHAIN, terms=(term,))
-
-
-DRY = model("coulomb_friction", place=1, force=0.002)
-DRAG = model("quadratic_drag", place=1, coefficient=4e-5)
-STIFF = model("cubic_spring", place=2, coefficient=0.02)
+DRY = model_with("coulomb_friction", CHAIN, place=1, force=0.002)
+DRAG = model_with("quadratic_drag", CHAIN, place=1, coefficient=4e-5)
+STIFF = model_with("cubic_spring", CHAIN, place=2, coefficient=0.02)
 
 
 def disputed(*models: AugmentedChain) -> Gap:
@@ -65,21 +59,13 @@ def disputed(*models: AugmentedChain) -> Gap:
         )
         for i in range(2)
     )  # fmt: skip
-    return Gap(
-        bench=BENCH,
-        verdict="ambiguous",
-        effects=(),
-        baseline=0.1,
-        final=0.01,
-        noise_floor=0.002,
-        repeatability=None,
+    return replace(
+        make_gap("ambiguous"),
         by_record=(),
-        where=(),
-        next_experiment="Steps of three sizes.",
+        noise_floor=0.002,
         linear=AugmentedChain(chain=CHAIN),
         model=models[0],
-        training=("step-a",),
-        held_out=("step-a",),
+        chain_std={},
         traces=traces,
         contenders=tuple(
             AlternativeModel(chain=one.chain, terms=one.terms, weight=1 / len(models))
@@ -161,8 +147,8 @@ def test_a_hopeless_contender_decides_nothing(proposed):
 def test_a_longer_recording_is_proposed_if_a_short_one_is_not_enough(proposed):
     """If twelve seconds cannot separate two explanations, a longer recording is proposed."""
     late, lagged = (
-        model("input_delay", place=0, delay=1e-4),
-        model("actuator_lag", place=0, time_constant=1e-4),
+        model_with("input_delay", CHAIN, delay=1e-4),
+        model_with("actuator_lag", CHAIN, time_constant=1e-4),
     )
     short, long = (
         gap.proposal.recording

@@ -13,12 +13,11 @@ from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
 from pipeline.json_files import plain
 from pipeline.plant.augmented import simulate_augmented
-from pipeline.plant.catalogue import CATALOGUE, find_effect
+from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
-from pipeline.plant.effect import AugmentedChain
 from pipeline.results import Record
 from pipeline.setup import Setup
-from tests.helpers.effects import make_term
+from tests.helpers.effects import model_with
 from tests.helpers.time_records import record_of
 from tests.truth.bench import Hidden, simulate_truth
 from tests.truth.cases import COUNT, make_case
@@ -292,14 +291,12 @@ def test_a_cart_without_recordings_does_not_change_the_verdict():
 def _late(*, seed: int) -> Record:
     """Return a sweep of a cart with a cubic spring that shows only in the last 40 %."""
     chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
-    term = make_term(
-        find_effect("cubic_spring"), place=1, values={"coefficient": 0.004}, chain=chain
-    )
+    model = model_with("cubic_spring", chain, place=1, coefficient=0.004)
     t = np.arange(0.0, 24.0, 5e-3)
     early = t < 15.0
     phase = 2 * np.pi * np.cumsum(np.where(early, 1.2, 2.0)) * 5e-3
     u = np.where(early, 0.01, 0.06) * np.sign(np.sin(phase))
-    y = simulate_augmented(AugmentedChain(chain=chain, terms=(term,)), t, u)
+    y = simulate_augmented(model, t, u)
     y = y + np.random.default_rng(seed).normal(0.0, 0.001, y.shape)
     return record_of(t, u, y, kind="sweep", count=COUNT, id="sweep")
 

@@ -9,13 +9,6 @@ from pipeline.gap.explain import two_workers
 LIMIT = 60.0  # s; a thread that waits longer waits for ever
 
 
-def test_results_keep_the_order_of_the_items():
-    """Results come in the order of the items, as from the built-in `map`."""
-    with two_workers() as mapper:
-        assert mapper(pow, [2, 3, 4], range(3)) == [1, 3, 16]
-        assert mapper(abs, []) == []
-
-
 def test_work_may_map_its_own_items():
     """A job that maps gets its own results, at every depth."""
     with two_workers() as mapper:

@@ -2,8 +2,9 @@
 
 from collections.abc import Mapping
 
+from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import Chain
-from pipeline.plant.effect import Effect, EffectTerm, chain_scales
+from pipeline.plant.effect import AugmentedChain, Effect, EffectTerm, chain_scales
 
 SIZES = {
     "coulomb_friction": {"force": 0.001},
@@ -39,3 +40,9 @@ def make_term(
     usual = {p.name: light.get(p.name, p.typical) * p.size(scales) for p in details} | {**values}
     sizes = tuple(float(usual[name]) for name in effect.names)
     return EffectTerm(effect=effect, place=place, values=sizes)
+
+
+def model_with(key: str, chain: Chain, *, place: int = 0, **values: float) -> AugmentedChain:
+    """Return a chain with one effect."""
+    term = make_term(find_effect(key), place=place, values=values, chain=chain)
+    return AugmentedChain(chain=chain, terms=(term,))

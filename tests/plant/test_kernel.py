@@ -10,12 +10,11 @@ from numpy.testing import assert_allclose
 from pipeline.arrays import Array
 from pipeline.plant.catalogue import find_effect
 from pipeline.plant.chain import PRESETS, Chain
-from pipeline.plant.effect import AugmentedChain
 from pipeline.plant.simulate import simulate_linear
 from pipeline.plant.simulator import kernel, sensitivity
 from pipeline.plant.simulator.kernel import StartState, describe_run
 from pipeline.plant.simulator.tables import Cart, Tables, linear_tables
-from tests.helpers.effects import SIZES, make_term
+from tests.helpers.effects import SIZES, model_with
 from tests.truth.bench import Hidden, simulate_truth
 
 COUNT = 0.00227  # cm, one encoder step
@@ -115,8 +114,7 @@ def test_cart_stays_where_friction_holds_it():
 def test_every_effect_agrees_with_the_fine_step_simulator(key):
     """For each effect, this simulator and an independent one with 50-µs steps agree."""
     chain = PRESETS["throne-2dof"]
-    effect = find_effect(key)
-    place = {"cart": 1, "spring": 2, "input": 0}[effect.place]
+    place = {"cart": 1, "spring": 2, "input": 0}[find_effect(key).place]
     values = dict(SIZES[key])
     m1, contact = chain.m[0], 60.0 * (chain.k[0] + chain.k[1])
     if key == "end_stop":
@@ -127,20 +125,12 @@ def test_every_effect_agrees_with_the_fine_step_simulator(key):
             "contact_stiffness": contact,
             "contact_damping": 0.3 * np.sqrt(contact * 0.15 * m1),
         }
-    term = make_term(effect, place=place, values=values, chain=chain)
     t = sample_times(450, 0.00884)
     u = np.where((t > 0.05) & (t < 2.0), 0.06, 0.0)
 
-    got = simulate(AugmentedChain(chain=chain, terms=(term,)).tables(), t, u, refine=3.0)
-    truth = simulate_truth(
-        m=chain.m,
-        c=chain.c,
-        k=chain.k,
-        hidden=[Hidden(effect=key, place=place, parameters=SIZES[key])],
-        t=t,
-        u=u,
-        free=(1, 2),
-    )
+    got = simulate(model_with(key, chain, place=place, **values).tables(), t, u, refine=3.0)
+    hidden = [Hidden(effect=key, place=place, parameters=SIZES[key])]
+    truth = simulate_truth(m=chain.m, c=chain.c, k=chain.k, hidden=hidden, t=t, u=u, free=(1, 2))
 
     # The 50-µs steps cause 0.1 count, and a contact of the other simulator is softer by one step.
     limit = {"end_stop": 1.5, "backlash": 0.6}.get(key, 0.25)
@@ -156,9 +146,7 @@ def test_delay_shifts_the_response():
     u = np.where(t > 0.1, 0.03, 0.0)
     plain = simulate(linear_tables(chain), t, u)
     for delay, shift in ((0.02, 4), (-0.02, -4)):
-        term = make_term(find_effect("input_delay"), place=0, values={"delay": delay}, chain=chain)
-
-        late = simulate(AugmentedChain(chain=chain, terms=(term,)).tables(), t, u)
+        late = simulate(model_with("input_delay", chain, delay=delay).tables(), t, u)
 
         assert_allclose(late[:, 100:400], plain[:, 100 - shift : 400 - shift], atol=1e-6)
 
@@ -166,12 +154,9 @@ def test_delay_shifts_the_response():
 def test_diverging_model_is_reported_as_nan():
     """If a softening spring gives way, the readings become NaN, without a crash or endless run."""
     chain = PRESETS["throne-1dof"]
-    term = make_term(
-        find_effect("cubic_spring"), place=1, values={"coefficient": -0.5}, chain=chain
-    )
     t = sample_times(600, 0.005)
 
-    tables = AugmentedChain(chain=chain, terms=(term,)).tables()
+    tables = model_with("cubic_spring", chain, place=1, coefficient=-0.5).tables()
     run = describe_run(t, np.full(t.size, 0.05), free=[True])
     start = StartState(np.zeros((1, 1)), np.zeros((1, 1)), np.ones(1))
 
@@ -211,25 +196,16 @@ def test_a_hidden_mass_starts_at_the_given_position():
     """A cart and its hidden mass, started apart, move as a chain of two carts."""
     chain = Chain(m=np.array([1.7e-4]), c=np.array([4e-4]), k=np.array([0.034, 0.0]))
     mass, stiffness = 2e-5, 0.004
-    term = make_term(
-        find_effect("extra_mode"),
-        place=1,
-        values={"mass": mass, "stiffness": stiffness, "damping": 0.0},
-        chain=chain,
-    )
+    hidden = {"mass": mass, "stiffness": stiffness, "damping": 0.0}
     pair = Chain(
         m=np.array([1.7e-4, mass]), c=np.array([4e-4, 0.0]), k=np.array([0.034, stiffness, 0.0])
     )
     t = sample_times(800, 0.002)
     cart, offset = (0.8, -3.0), (0.15, 2.0)  # position in cm and velocity in cm/s
 
-    got = simulate(
-        AugmentedChain(chain=chain, terms=(term,)).tables(),
-        t,
-        np.zeros(t.size),
-        x0=[cart[0], offset[0]],
-        v0=[cart[1], offset[1]],
-    )
+    tables = model_with("extra_mode", chain, place=1, **hidden).tables()
+    x0, v0 = zip(cart, offset, strict=True)
+    got = simulate(tables, t, np.zeros(t.size), x0=x0, v0=v0)
 
     start = np.array([cart[0], cart[1], cart[0] + offset[0], cart[1] + offset[1]])
     true = simulate_linear(pair, t, np.zeros(t.size), x0=start)[0]
@@ -261,8 +237,7 @@ def test_an_input_that_changes_within_a_step_is_exact(preset):
 def test_a_jump_within_a_step_frees_a_held_cart_at_once():
     """If the input jumps within a step, a cart held by friction is freed at the jump."""
     chain = PRESETS["throne-1dof"]
-    dry = make_term(find_effect("coulomb_friction"), place=1, values={"force": 6e-3}, chain=chain)
-    tables = AugmentedChain(chain=chain, terms=(dry,)).tables()
+    tables = model_with("coulomb_friction", chain, place=1, force=6e-3).tables()
     t, edge = sample_times(100, 4e-3), 0.0411
     knots, command = np.array([0.0, edge]), np.array([0.0, 0.02])
 
@@ -279,8 +254,7 @@ def test_a_jump_within_a_step_frees_a_held_cart_at_once():
 def test_lag_and_delay_are_right_in_long_steps(key, values):
     """In a fast sweep with four ticks per step, lag and delay are right to a tenth of a count."""
     chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
-    term = make_term(find_effect(key), place=0, values=values, chain=chain)
-    tables = AugmentedChain(chain=chain, terms=(term,)).tables()
+    tables = model_with(key, chain, **values).tables()
     ticks = sample_times(4000, 1e-3)
     u = 0.16 * np.sin(2 * np.pi * (7 * ticks + 13 / 8 * ticks**2))
 

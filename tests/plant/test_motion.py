@@ -11,7 +11,7 @@ from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain, Effect, chain_scales
 from pipeline.plant.motion import EquationsOfMotion
-from tests.helpers.effects import make_term
+from tests.helpers.effects import model_with
 
 CHAIN = PRESETS["throne-2dof"]
 T = np.arange(0.0, 1.5, 0.002)
@@ -23,9 +23,7 @@ def usual(effect: Effect) -> AugmentedChain:
     place = (effect.places((True, True, True)) or (0,))[-1]
     scales = chain_scales(CHAIN, place=effect.place, at=place, input=LEVEL)
     values = {p.name: p.size(scales) * p.typical for p in effect.parameters}
-    return AugmentedChain(
-        chain=CHAIN, terms=(make_term(effect, place=place, values=values, chain=CHAIN),)
-    )
+    return model_with(effect.key, CHAIN, place=place, **values)
 
 
 def respond(model: AugmentedChain, x0, *, driven: bool):

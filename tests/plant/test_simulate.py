@@ -78,16 +78,6 @@ def test_held_carts_are_walls():
     assert_array_equal(simulate_linear(THREE, t, u, free=(1, 2)), simulate_linear(short, t, u))
 
 
-def test_the_motor_does_not_reach_past_a_held_first_cart():
-    """If cart 1 is held, the input moves no cart."""
-    t = clock(50)
-
-    x = simulate_linear(THREE, t, np.ones(t.size), free=(2, 3))
-
-    assert x.shape == (2, 50)
-    assert_array_equal(x, 0.0)
-
-
 def test_steady_state_of_a_band_limited_sine():
     """A band-limited input is a smooth sine between its few samples."""
     omega = 2 * np.pi * 4.0

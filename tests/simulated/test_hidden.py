@@ -11,7 +11,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import ConfigError, DataError
-from pipeline.gap.types import Gap
 from pipeline.ingest.read import read_data
 from pipeline.json_files import plain
 from pipeline.plant.augmented import rest_positions
@@ -19,12 +18,12 @@ from pipeline.plant.catalogue import CATALOGUE, find_effect
 from pipeline.plant.chain import PRESETS
 from pipeline.plant.effect import AugmentedChain
 from pipeline.plant.sampled_loop import StateFeedback
-from pipeline.setup import Setup
 from pipeline.simulated.bench import COUNT, SAMPLE_TIME, BenchRun, ReleasingHand, SimulatedBench
 from pipeline.simulated.hidden import prepare_bench, preset_bench, usual_term
 from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
 from tests.helpers.commandline import cartlab_here
+from tests.helpers.gaps import make_gap
 from tests.truth.bench import Hidden, simulate_truth
 
 TWO = PRESETS["throne-2dof"]
@@ -40,12 +39,8 @@ def bench(*terms, chain=TWO):
 def usual(key, chain=TWO, **changes):
     """Return the effect at its usual place and size, with some parameters changed."""
     term = usual_term(find_effect(key), chain)
-    values = dict(zip(term.effect.names, term.values, strict=True)) | changes
+    values = term.parameters | changes
     return replace(term, values=tuple(values[name] for name in term.effect.names))
-
-
-def named(term):
-    return dict(zip(term.effect.names, term.values, strict=True))
 
 
 def clock(seconds):
@@ -155,7 +150,7 @@ IN_LOOPS = {
 def test_runs_agree_with_the_independent_simulator(key, run):
     """The 50-µs simulator, driven by the logged input, gives the logged motion in each run."""
     term = usual(key)
-    hidden = Hidden(effect=key, place=term.place, parameters=named(term))
+    hidden = Hidden(effect=key, place=term.place, parameters=term.parameters)
 
     moved, linear = bench(term).move(run), bench().move(run)
 
@@ -185,7 +180,7 @@ def test_releases_agree_with_the_independent_simulator(key):
     start = int(np.searchsorted(run.t, hand.release))
     held = float(hand.hold(run.t[start])[0])
     spring = TWO.k[0] + TWO.k[1]
-    extra = named(term)["coefficient"] * held**3 if key == "cubic_spring" else 0.0
+    extra = term.parameters["coefficient"] * held**3 if key == "cubic_spring" else 0.0
     fine = np.arange(run.t[start], run.t[-1] + 1e-9, SAMPLE_TIME / 40)
     # The force is linear between samples; each fine step takes its value in the middle.
     samples = run.t[start:]
@@ -193,7 +188,7 @@ def test_releases_agree_with_the_independent_simulator(key):
     push = np.interp(fine + SAMPLE_TIME / 80, samples, ramp)
     truth = simulate_truth(
         m=TWO.m, c=TWO.c, k=TWO.k, t=fine, u=push, free=(1,), x0=np.array([held, 0.0]),
-        hidden=[Hidden(effect=key, place=term.place, parameters=named(term))],
+        hidden=[Hidden(effect=key, place=term.place, parameters=term.parameters)],
     )  # fmt: skip
     # The phase of the 50-µs simulator errs by omega h / 2. At the spring's stiffest that is 1e-3 of
     # 1.5 cm.
@@ -261,13 +256,7 @@ def test_a_loop_cannot_look_ahead():
 def stored(prepared):
     """Return the `gap.json` of a bench, as the gap workflow writes it."""
     model = AugmentedChain(chain=prepared.chain, terms=prepared.effects)
-    gap = Gap(
-        bench=Setup(springs=tuple(bool(k) for k in prepared.chain.k)),
-        verdict="named", effects=(), baseline=0.1, final=0.01, noise_floor=0.01,
-        repeatability=None, by_record=(), where=(), next_experiment="", linear=model, model=model,
-        training=(), held_out=(), traces=(),
-    )  # fmt: skip
-    return plain(gap)
+    return plain(replace(make_gap(), model=model))
 
 
 @pytest.mark.slow
