@@ -37,11 +37,11 @@ from pipeline.gap.summary import (
     make_traces,
     repeatability,
 )
-from pipeline.gap.types import FoundEffect, Gap
+from pipeline.gap.types import Gap
 from pipeline.plant.augmented import compile_simulator
 from pipeline.plant.catalogue import CATALOGUE
 from pipeline.plant.chain import Chain
-from pipeline.plant.effect import Effect, EffectTerm
+from pipeline.plant.effect import Effect
 from pipeline.plant.simulator.compiler import is_compiled, kept_in
 from pipeline.results import Analysis, Intervention, Record
 from pipeline.setup import Setup
@@ -269,6 +269,8 @@ def _describe(search: Search, bench: Setup) -> Gap:
     effects = list_effects(path, final, found, units)
     traces = make_traces(path[0], chosen, study)
     model = final.structure.model(final.theta)
+    order = [(found.effect.key, found.where) for found in effects]
+    terms = sorted(model.terms, key=lambda term: order.index((term.effect.key, term.where)))
     enough = verdict in ("none", "named")
     settled = enough and study.is_noise(chosen)
     left = () if enough else find_windows(chosen.fit, study.training)
@@ -288,7 +290,7 @@ def _describe(search: Search, bench: Setup) -> Gap:
         by_record=compare_by_record(traces, study),
         where=find_windows(path[0].fit, study.training) if verdict != "none" else (),
         linear=path[0].fit.structure.model(path[0].fit.theta),
-        model=replace(model, terms=_in_order(model.terms, effects)),
+        model=replace(model, terms=tuple(terms)),
         training=tuple(dict.fromkeys(run.id for run in study.training)),
         held_out=tuple(dict.fromkeys(run.id for run in study.held_out)),
         traces=traces,
@@ -323,11 +325,3 @@ def _learnt_spread(fit: GapFit) -> dict[int, float]:
     moved = np.any([nuisance.scatter != 1.0 for nuisance in fit.nuisance], axis=0)
     dry = fit.structure.dry
     return {i + 1: float(fit.spread[i]) for i in range(len(dry)) if dry[i] and moved[i]}
-
-
-def _in_order(
-    terms: Sequence[EffectTerm], effects: Sequence[FoundEffect]
-) -> tuple[EffectTerm, ...]:
-    """Return the terms in the order in which the effects were found."""
-    order = [(found.effect.key, found.where) for found in effects]
-    return tuple(sorted(terms, key=lambda term: order.index((term.effect.key, term.where))))

@@ -5,6 +5,7 @@ Reference: J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., section 10
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -232,7 +233,7 @@ def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
         best = trial
         damp = max(damp / _RELAX, _LEAST_DAMP)
         if how.learn_spread and iteration >= 1:
-            best = _learn_spread(best, runs, linear)
+            best = _learn_spread(best, linear)
         if fall < how.tolerance:
             break
     return best
@@ -314,27 +315,23 @@ def anchor(runs: Sequence[GapRun], size: int) -> Array:
     return row
 
 
-def _learn_spread(fit: GapFit, runs: Sequence[GapRun], linear: Sequence[Linear]) -> GapFit:
+def _learn_spread(fit: GapFit, linear: Sequence[Linear]) -> GapFit:
     """Estimate how much each cart's friction differs from run to run."""
-    spread = fit.spread.copy()
-    factors = np.array([nuisance.scatter for nuisance in fit.nuisance])
-    noise = max(1.0, fit.chi)
-    for i, dry in enumerate(fit.structure.dry):
-        if not dry:
-            continue
+    spread, noise = fit.spread.copy(), max(1.0, fit.chi)
+    weight, prior = 3.0, 0.04  # the prior counts as three runs with a spread of 4 %
+    for i in range(spread.size):
         there = [
-            (r, linear[r].layout.scatter.index(i))
-            for r, run in enumerate(runs)
-            if i in linear[r].layout.scatter
+            (nuisance.scatter[i], part.run_wide[j, j])
+            for nuisance, part in zip(fit.nuisance, linear, strict=True)
+            for j, cart in enumerate(part.layout.scatter)
+            if cart == i
         ]
         if not there:
             continue
-        weight, prior = 3.0, 0.04  # the prior counts as three runs with a spread of 4 %
         total = weight * prior**2
-        for r, j in there:
-            column = linear[r].run_wide[j, j]
+        for factor, column in there:
             variance = min(noise / column**2 if column else np.inf, spread[i] ** 2)
-            total += (factors[r, i] - 1.0) ** 2 + variance
+            total += (factor - 1.0) ** 2 + variance
         spread[i] = np.clip(np.sqrt(total / (len(there) + weight)), _SCATTER_FLOOR, _SCATTER_TOP)
     return replace(fit, spread=spread)
 
@@ -583,16 +580,9 @@ def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> Gap
     same friction for all runs, the variation is estimated from the residuals (R. DerSimonian, N.
     Laird, Controlled Clinical Trials 7 (1986), 177-188).
     """
-
-    def weigh(
-        job: tuple[int, tuple[GapRun, Nuisance]],
-    ) -> tuple[Array, dict[int, tuple[float, float]]]:
-        index, (run, nuisance) = job
-        # Seeded by the run's index, so that each run has its own draws.
-        rng = np.random.default_rng([0, index])
-        return _weigh(fit, run, nuisance, rng=rng)
-
-    weighed = list(mapper(weigh, enumerate(zip(runs, fit.nuisance, strict=True))))
+    # Each run has its own draws.
+    draws = [np.random.default_rng([0, index]) for index in range(len(runs))]
+    weighed = list(mapper(partial(_weigh, fit), runs, fit.nuisance, draws))
     told = np.sum([of_run for of_run, _ in weighed], axis=0)
     if not np.all(np.isfinite(told)):
         return fit
@@ -616,7 +606,7 @@ def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> Gap
 
 
 def _weigh(
-    fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator
+    fit: GapFit, run: GapRun, nuisance: Nuisance, rng: np.random.Generator
 ) -> tuple[Array, dict[int, tuple[float, float]]]:
     """Return what one run tells about the parameters, and about the friction of each cart.
 

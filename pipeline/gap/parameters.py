@@ -14,7 +14,7 @@ Reference: G. H. Golub, V. Pereyra, Inverse Problems 19 (2003), R1 (separable le
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -568,27 +568,24 @@ def _differences(
     With contacts the misfit has many narrow minima, and a finite difference averages over them.
     """
     position, velocity = usual_sizes(model, run)
+    changes = [
+        *(("x0", i, _START_STEP * position[i]) for i in layout.x0),
+        *(("v0", i, _START_STEP * velocity[i]) for i in layout.v0),
+        *(("scatter", i, _START_STEP) for i in layout.scatter),
+    ]
+    starts = [nuisance.start]
+    for name, i, size in changes:
+        values = getattr(nuisance, name).copy()
+        values[..., i] += size
+        starts.append(replace(nuisance, **{name: values}).start)
+    own, varied = len(changes), model.varied if layout.shared else ()
+    models = [*[model] * len(starts), *varied]
+    starts += [nuisance.start] * len(varied)
+    y, _ = _simulate_variants(models, run, starts)
     steps = model.structure.steps() if layout.shared else np.zeros(0)
-    x_steps = _START_STEP * position[list(layout.x0)]
-    v_steps = _START_STEP * velocity[list(layout.v0)]
-    g_steps = np.full(len(layout.scatter), _START_STEP)
-    divisors = np.concatenate([x_steps, v_steps, g_steps, steps])
-    b, lane = 1 + divisors.size, 1
-    x0, v0, scatter = (
-        np.repeat(a[None], b, axis=0) for a in (nuisance.x0, nuisance.v0, nuisance.scatter)
-    )
-    for values, places, sizes in (
-        (np.moveaxis(x0, 1, -1), layout.x0, x_steps),
-        (np.moveaxis(v0, 1, -1), layout.v0, v_steps),
-        (scatter, layout.scatter, g_steps),
-    ):
-        for i, size in zip(places, sizes, strict=True):
-            values[lane, i] += size
-            lane += 1
-    models = [*[model] * lane, *(model.varied if layout.shared else ())]
-    y, _ = _simulate_variants(models, run, list(map(StartState, x0, v0, scatter)))
+    divisors = np.append([size for _, _, size in changes], steps)
     by = (y[1:] - y[0]) / divisors[:, None, None]
-    return y[0], by[: lane - 1], by[lane - 1 :]
+    return y[0], by[:own], by[own:]
 
 
 def usual_sizes(model: GapModel, run: GapRun) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ from pipeline.arrays import Array
 from pipeline.gap.fit import GapFit
 from pipeline.gap.judge import Hypothesis, Study
 from pipeline.gap.limits import AT_FLOOR
-from pipeline.gap.parameters import Nuisance, fresh_nuisance, simulate_run
+from pipeline.gap.parameters import fresh_nuisance, simulate_run
 from pipeline.gap.runs import GapRun
 from pipeline.gap.types import (
     Alternative,
@@ -232,35 +232,25 @@ def chain_covariance(fit: GapFit) -> Array | None:
     return relative * np.outer(scale, scale)
 
 
-def _sides_of(hypothesis: Hypothesis, study: Study) -> list[tuple[GapRun, Nuisance, bool]]:
-    """Return every run with its nuisance parameters, and whether it was held out."""
-    training = zip(study.training, hypothesis.fit.nuisance, strict=True)
-    held_out = zip(study.held_out, hypothesis.held.nuisance, strict=True)
-    return [(run, nuisance, False) for run, nuisance in training] + [
-        (run, nuisance, True) for run, nuisance in held_out
-    ]
-
-
 def make_traces(before: Hypothesis, after: Hypothesis, study: Study) -> tuple[Trace, ...]:
     """Return the measured and simulated motion of every cart in every run, for both models."""
-    out = []
-    for (run, nuisance_before, held), (_, nuisance_after, _) in zip(
-        _sides_of(before, study), _sides_of(after, study), strict=True
-    ):
-        linear = simulate_run(before.fit, run, nuisance_before)
-        final = simulate_run(after.fit, run, nuisance_after)
+    out, runs = [], (*study.training, *study.held_out)
+    own = [(*one.fit.nuisance, *one.held.nuisance) for one in (before, after)]
+    for index, (run, own_before, own_after) in enumerate(zip(runs, *own, strict=True)):
+        linear = simulate_run(before.fit, run, own_before)
+        final = simulate_run(after.fit, run, own_after)
         u = run.record.input[-run.t.size :]
         out += [
             Trace(
                 experiment=run.id,
                 cart=row + 1,
-                held_out=held,
+                held_out=index >= len(study.training),
                 t=run.t,
                 u=u,
                 measured=run.y[j],
                 baseline=linear[j],
                 final=final[j],
-                zero=float(nuisance_after.zero[row]),
+                zero=float(own_after.zero[row]),
             )
             for j, row in enumerate(run.rows)
         ]

@@ -132,8 +132,15 @@ class SteppedBench:
             smooth=longest_step(*self._tables)[1],
             contact_step=contact_step,
         )
-        self._close_contacts()
-        self._bend_presliding()
+        for e, which in enumerate(bodies.switches):
+            if contact_gap(which, False, self._tables, bodies.s, 0.0) > 0.0:  # closed at the start
+                bodies.active[e] = True
+                toggle_contact(which, 1.0, self._tables, bodies.s, bodies.K, bodies.C)
+        # Presliding friction balances the forces at rest, if it can.
+        net = self._static_forces()
+        most = np.array([hysteresis(self._tables.cart, i, 0.0)[0] for i in range(n)])
+        for i in np.flatnonzero(most):
+            self._state[kernel.Z, i] = np.clip(net[i] / most[i], -1.0, 1.0)
         self._now = 0.0
         self._inputs: deque[tuple[float, float]] = deque([(-np.inf, 0.0)])
         self._lagged = 0.0
@@ -236,21 +243,6 @@ class SteppedBench:
         s[kernel.MID_X], s[kernel.MID_V], s[kernel.FORCE] = s[kernel.X], 0.0, s[kernel.FIX]
         smooth_forces(self._tables, self._bodies, 0.0, 0.0, self._push.smooth)
         return s[kernel.FORCE] - self._bodies.K @ s[kernel.X]
-
-    def _close_contacts(self) -> None:
-        """Add the contacts that are closed at the start to the matrices."""
-        bodies = self._bodies
-        for e, which in enumerate(bodies.switches):
-            if contact_gap(which, False, self._tables, bodies.s, 0.0) > 0.0:
-                bodies.active[e] = True
-                toggle_contact(which, 1.0, self._tables, bodies.s, bodies.K, bodies.C)
-
-    def _bend_presliding(self) -> None:
-        """Set the presliding states so that friction balances the forces at rest, if it can."""
-        net = self._static_forces()
-        most = np.array([hysteresis(self._tables.cart, i, 0.0)[0] for i in range(self._n)])
-        for i in np.flatnonzero(most):
-            self._state[kernel.Z, i] = np.clip(net[i] / most[i], -1.0, 1.0)
 
     def _step_lengths(self) -> tuple[float, float]:
         """Return the longest substep, and the longest inside a contact, s."""

@@ -324,11 +324,8 @@ class Description:
     ) -> None:
         chain, terms = model.chain, model.terms
         _refuse_lead(terms)
-        by_law: dict[type, list[effect.EffectTerm]] = {}
-        for term in terms:
-            by_law.setdefault(type(term.effect.law), []).append(term)
         built = {
-            kind: [term for term in by_law.get(effect.BuiltLaw, []) if term.effect.is_built(kind)]
+            kind: [term for term in terms if term.effect.is_built(kind)]
             for kind in ("hidden mass", "play", "delay", "lag", "reading")
         }
         play = None
