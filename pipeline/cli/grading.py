@@ -381,10 +381,14 @@ def history(grades: Grades, team: Team, assignment: Lab = None, as_json: AsJson 
 
     with Gradebook(grades, assignment=assignment) as book:
         submission, events = history_of(book, team)
-    if as_json:
-        typer.echo(json.dumps(history_dict(submission, events), indent=1, ensure_ascii=False))
-    else:
-        typer.echo(history_text(submission, events))
+    told = history_dict if as_json else history_text
+    _show(told(submission, events))
+
+
+def _show(found: str | dict[str, Any]) -> None:
+    """Print a text, or a dictionary as JSON."""
+    text = found if isinstance(found, str) else json.dumps(found, indent=1, ensure_ascii=False)
+    typer.echo(text)
 
 
 PlatformName = StrEnum("PlatformName", list(PLATFORMS))
@@ -468,10 +472,7 @@ def survey(
     found = read_survey(file)
     if found.left_out:
         say(f"left out, because no table has these questions: {', '.join(found.left_out)}")
-    if as_json:
-        typer.echo(json.dumps(survey_dict(found), indent=1, ensure_ascii=False))
-    else:
-        typer.echo(survey_text(found))
+    _show(survey_dict(found) if as_json else survey_text(found))
 
 
 @app.command("new-rubric")
@@ -526,8 +527,7 @@ def check_rubric(
     from pipeline.grading.rubric_text import rubric_dict, rubric_text
 
     rubric = load_rubric(file)
-    shown: dict[str, Any] = {} if not as_json else rubric_dict(rubric)
-    text = "" if as_json else rubric_text(rubric)
+    shown = rubric_dict(rubric) if as_json else rubric_text(rubric)
     if reference is not None:
         from pipeline.grading.simulated_class import class_dict, class_text, simulate_class
         from pipeline.submission import load_submission
@@ -535,11 +535,8 @@ def check_rubric(
         submission = load_submission(reference)
         with progress_line() as progress:
             found = simulate_class(submission, rubric=rubric, progress=progress)
-        if as_json:
+        if isinstance(shown, dict):
             shown["simulated"] = class_dict(found)
         else:
-            text += f"\n\n{class_text(found)}"
-    if as_json:
-        typer.echo(json.dumps(shown, indent=1, ensure_ascii=False))
-    else:
-        typer.echo(text)
+            shown += f"\n\n{class_text(found)}"
+    _show(shown)

@@ -40,8 +40,8 @@ class Reference:
     value: float
     low: float
     high: float
-    std: float
-    source: str
+    std: float = 0.0
+    source: str = ""
 
     @classmethod
     def at(cls, value: float, *, std: float = 0.0, source: str = "") -> "Reference":
@@ -74,13 +74,8 @@ class Reference:
 
     def times(self, factor: float) -> "Reference":
         """Return the reference multiplied by a positive factor."""
-        return Reference(
-            value=factor * self.value,
-            low=factor * self.low,
-            high=factor * self.high,
-            std=factor * self.std,
-            source=self.source,
-        )
+        scaled = {x: factor * getattr(self, x) for x in ("value", "low", "high", "std")}
+        return Reference(**scaled, source=self.source)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -522,9 +517,8 @@ def step_turns(name: str, analysis: Analysis) -> StepTurns:
 
 
 def _spread(values: Sequence[float]) -> Reference:
-    return Reference(
-        value=float(np.median(values)), low=min(values), high=max(values), std=0.0, source="step"
-    )
+    middle = float(np.median(values))
+    return Reference(value=middle, low=min(values), high=max(values), source="step")
 
 
 def _turns(step: StepGain, record: Record) -> Iterator[tuple[Edge, Array, list[float]]]:

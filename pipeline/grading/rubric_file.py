@@ -1,28 +1,17 @@
 """Read a rubric; each mistake in it is reported in one line with file, line, key and suggestion."""
 
 from collections.abc import Iterator, Sequence
-from copy import deepcopy
-from dataclasses import dataclass
 from decimal import Decimal
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from pipeline.errors import ConfigError
-from pipeline.grading import rubric
-from pipeline.grading.rubric import (
-    InitialFinal,
-    Manual,
-    Parameters,
-    RequiredPieces,
-    Rubric,
-    StateModel,
-    matching,
-    source_of,
-)
+from pipeline.grading import rubric as asked
+from pipeline.grading.rubric import Rubric, matching, source_of
 from pipeline.names import derived_names, read_name
 from pipeline.resources import RUBRICS
 from pipeline.submission.load import spring_names
@@ -42,14 +31,12 @@ from pipeline.submission.toml import (
 )
 
 _MAX_BYTES = 1_000_000
-_CHECKS: dict[str, type[BaseModel]] = {
-    check: model
-    for model in get_args(get_args(rubric.Criterion)[0])
+_CHECKS: tuple[str, ...] = tuple(
+    check
+    for model in get_args(get_args(asked.Criterion)[0])
     for check in get_args(model.model_fields["check"].annotation)
-}
-_OF_CRITERIA = tuple(rubric.DataQuality.model_fields)  # keys that every criterion has
-# Valid values that replace wrong or missing ones, so that further mistakes can be found.
-_HARMLESS: dict[str | int, Any] = {"version": 1, "points": 1.0, "id": "criterion", "kind": "step"}
+)
+_OF_CRITERIA = tuple(asked.DataQuality.model_fields)  # keys that every criterion has
 
 
 def load_rubric(path: Path) -> Rubric:
@@ -119,119 +106,43 @@ def parse_rubric(text: str, *, where: str) -> Rubric:
         document = read_toml(text, root=Rubric)
     except TomlSlip as slip:
         raise InvalidRubric(where, [(slip.line, str(slip))]) from None
-    found = _validate(document)
-    if not found.complaints and found.rubric is not None:
-        return found.rubric
-    problems = [(_line_of(text, one.at), one.what) for one in found.complaints]
-    raise InvalidRubric(where, sorted(problems))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Complaint:
-    """A problem, and its place in the document."""
-
-    at: Location
-    what: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Validated:
-    rubric: Rubric | None
-    complaints: Sequence[_Complaint]
-
-
-def _validate(document: dict) -> _Validated:
-    """Check a document and report all problems, even those that an earlier one would hide."""
-    complaints: list[_Complaint] = []
-    criteria = document.get("criteria")
-    if isinstance(criteria, tuple):
-        tagged = [_with_check(own, i, document, complaints) for i, own in enumerate(criteria)]
-        document = {**document, "criteria": tuple(tagged)}
-    rubric, wrong = _try(document)
-    complaints += [_complaint(error, document) for error in relevant_errors(wrong)]
-    if wrong:
-        rubric, _ = _try(_without(document, wrong))
-    if rubric is not None:
-        own = criteria if isinstance(criteria, tuple) else ()
-        ids = [one.get("id") if isinstance(one, dict) else None for one in own]
-        complaints += [
-            _Complaint(at=at, what=f"{dotted(at, document)}: {what}")
-            for at, what in _contradictions(rubric, ids)
-        ]
-    return _Validated(rubric=rubric, complaints=complaints)
-
-
-def _try(document: dict) -> tuple[Rubric | None, list[ErrorDetails]]:
     try:
-        return Rubric.model_validate(document, strict=True), []
+        rubric = Rubric.model_validate(document, strict=True)
     except ValidationError as error:
-        return None, error.errors()
-
-
-def _with_check(own: Any, i: int, document: dict, complaints: list[_Complaint]) -> Any:
-    """Return a criterion with a valid check, so that its other keys can be checked too.
-
-    If its check is unknown or missing, a problem is added to `complaints`, and the nearest valid
-    check is used.
-    """
-    # A list, because the typed value may be unhashable.
-    if not isinstance(own, dict) or own.get("check") in list(_CHECKS):
-        return own
-    at: Location = ("criteria", i, "check")
-    meant = get_close_matches("check", [key for key in own if key not in _OF_CRITERIA], n=1)
-    if "check" in own:
-        typed = own["check"]
-        what = f"no such check {quote(typed)}{nearest(typed, tuple(_CHECKS))}"
-    elif meant:
-        at, typed = ("criteria", i, meant[0]), own[meant[0]]
-        what = "unknown key; did you mean 'check'?"
+        wrong = relevant_errors(error.errors())
+        problems = [
+            _unknown_check(one, document)
+            if one["type"].startswith("union_tag") and "criteria" in one["loc"]
+            else (without_tag(one["loc"], document), explain(one, document, root=Rubric))
+            for one in wrong
+        ]
     else:
-        typed, what = "", f"is required and missing{nearest('', tuple(_CHECKS))}"
-    complaints.append(_Complaint(at=at, what=f"{dotted(at, document)}: {what}"))
-    left = {key: value for key, value in own.items() if key not in meant}
-    close = get_close_matches(str(typed), list(_CHECKS), n=1)
-    if not close:  # no known check is similar, so only the common keys can be checked
-        left = {key: value for key, value in left.items() if key in _OF_CRITERIA}
-    return {**left, "check": close[0] if close else "data"}
+        problems = [(at, f"{dotted(at, document)}: {what}") for at, what in _contradictions(rubric)]
+        if not problems:
+            return rubric
+    raise InvalidRubric(where, sorted((_line_of(text, at), what) for at, what in problems))
 
 
-def _complaint(error: ErrorDetails, document: dict) -> _Complaint:
-    """Return an error of pydantic as a problem, with the keys of the file."""
-    return _Complaint(
-        at=without_tag(error["loc"], document),
-        what=explain(error, document, root=Rubric),
-    )
-
-
-def _without(document: dict, wrong: Sequence[ErrorDetails]) -> dict:
-    """Return a document in which wrong values are replaced by valid ones or removed."""
-    left = deepcopy(document)
-    for error in wrong:
-        *way, key = without_tag(error["loc"], document)
-        here: Any = left
-        for part in way:
-            try:
-                here = here[part]
-            except (KeyError, IndexError, TypeError):
-                here = None
-        if isinstance(here, dict) and key in _HARMLESS:
-            here[key] = _HARMLESS[key]
-        elif isinstance(here, dict):
-            here.pop(key, None)
-    return left
+def _unknown_check(error: ErrorDetails, document: dict) -> tuple[Location, str]:
+    """Return place and problem of a criterion whose check is missing or unknown."""
+    own, at = error["input"], (*error["loc"], "check")
+    near = get_close_matches("check", [key for key in own if key not in _OF_CRITERIA], n=1)
+    if "check" in own:
+        what = f"no such check {quote(own['check'])}{nearest(own['check'], _CHECKS)}"
+    elif near:
+        at, what = (*error["loc"], near[0]), "unknown key; did you mean 'check'?"
+    else:
+        what = f"is required and missing{nearest('', _CHECKS)}"
+    return at, f"{dotted(at, document)}: {what}"
 
 
 # ------------------------------------------------- contradictions between the tables
 
 
-def _contradictions(found: Rubric, ids: Sequence[object]) -> Iterator[tuple[Location, str]]:
-    """Yield place and problem of each contradiction between tables.
-
-    Parameters
-    ----------
-    ids : the ids of the criteria as typed.
-    """
+def _contradictions(found: Rubric) -> Iterator[tuple[Location, str]]:
+    """Yield place and problem of each contradiction between tables."""
     n, names = found.system.carts, found.names
+    ids = [criterion.id for criterion in found.criteria]
     if not found.criteria:
         yield ("criteria",), "missing; add a [[criteria]] table for each criterion"
     if found.step != round(found.step, 2):
@@ -258,13 +169,14 @@ def _contradictions(found: Rubric, ids: Sequence[object]) -> Iterator[tuple[Loca
         for pattern in getattr(found.required, table):
             if not matching((pattern,), names):
                 yield ("required", table), f"no parameter {pattern!r}{_nearest(pattern, names)}"
-    by_person = {criterion.id for criterion in found.criteria if isinstance(criterion, Manual)}
+    by_person = {
+        criterion.id for criterion in found.criteria if isinstance(criterion, asked.Manual)
+    }
     seen: set[str] = set()
-    known_ids = [id_ for id_ in ids if isinstance(id_, str)]
-    for i, (id_, criterion) in enumerate(zip(ids, found.criteria, strict=True)):
-        if isinstance(id_, str) and id_ in seen:
-            yield ("criteria", i, "id"), f"{id_!r} was used before"
-        if isinstance(criterion, Manual) and criterion.requires:
+    for i, criterion in enumerate(found.criteria):
+        if criterion.id in seen:
+            yield ("criteria", i, "id"), f"{criterion.id!r} was used before"
+        if isinstance(criterion, asked.Manual) and criterion.requires:
             yield ("criteria", i, "requires"), "has no effect, because a person grades this"
         for parent in criterion.requires:
             if parent in by_person:
@@ -272,10 +184,9 @@ def _contradictions(found: Rubric, ids: Sequence[object]) -> Iterator[tuple[Loca
                 yield ("criteria", i, "requires"), what
             if parent not in seen:
                 where = "comes later" if parent in ids else "is not a criterion"
-                known = "" if parent in ids else nearest(parent, known_ids)
+                known = "" if parent in ids else nearest(parent, ids)
                 yield ("criteria", i, "requires"), f"{parent!r} {where}{known}"
-        if isinstance(id_, str):
-            seen.add(id_)
+        seen.add(criterion.id)
         points = criterion.points
         if points != round(points, 2):
             yield ("criteria", i, "points"), f"{points:g}: points have at most two decimals"
@@ -283,28 +194,27 @@ def _contradictions(found: Rubric, ids: Sequence[object]) -> Iterator[tuple[Loca
             message = f"{points:g} is not a multiple of step = {found.step:g}"
             yield ("criteria", i, "points"), message
         states = [f"{x}{cart}" for cart in range(1, n + 1) for x in "xv"]
-        named = criterion.states if isinstance(criterion, StateModel) else ()
+        named = criterion.states if isinstance(criterion, asked.StateModel) else ()
         if named and sorted(named) != sorted(states):
             yield ("criteria", i, "states"), f"needs each of {', '.join(states)} once"
-        if isinstance(criterion, Parameters) and source_of(criterion) == "own":
+        if isinstance(criterion, asked.Parameters) and source_of(criterion) == "own":
             derived = derived_names(n)
-            for name in matching(criterion.parameters, names):
-                if name not in derived:
-                    known = f", as {', '.join(derived)} do" if derived else ""
-                    what = (
-                        f'{name} does not follow from the other numbers{known}: remove from = "own"'
-                    )
-                    yield ("criteria", i, "parameters"), what
-                    break
-        if isinstance(criterion, Parameters | InitialFinal):
+            given = [n for n in matching(criterion.parameters, names) if n not in derived]
+            if given:
+                known = f", as {', '.join(derived)} do" if derived else ""
+                what = (
+                    f'{given[0]} does not follow from the other numbers{known}: remove from = "own"'
+                )
+                yield ("criteria", i, "parameters"), what
+        if isinstance(criterion, asked.Parameters | asked.InitialFinal):
             for pattern in criterion.parameters:
                 if not matching((pattern,), names):
                     known = _nearest(pattern, names)
                     yield ("criteria", i, "parameters"), f"no parameter {pattern!r}{known}"
-        if isinstance(criterion, RequiredPieces):
-            asked = list(dict.fromkeys(runs.kind for runs in found.required.experiments))
-            for kind in (kind for kind in criterion.experiments if kind not in asked):
-                what = f"no [[required.experiments]] has kind {kind!r}{nearest(kind, asked)}"
+        if isinstance(criterion, asked.RequiredPieces):
+            kinds = list(dict.fromkeys(runs.kind for runs in found.required.experiments))
+            for kind in (kind for kind in criterion.experiments if kind not in kinds):
+                what = f"no [[required.experiments]] has kind {kind!r}{nearest(kind, kinds)}"
                 yield ("criteria", i, "experiments"), what
         for full in (name for name in type(criterion).model_fields if "full" in name):
             none = full.replace("full", "none")

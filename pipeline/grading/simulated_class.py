@@ -104,14 +104,12 @@ class _Students:
             "missing": _incomplete,
         }
 
-    def grade(self, own: Reported) -> Grade:
-        """Return the grade of a report."""
-        return self._graded(own, self._bench)
-
-    def _graded(self, own: Reported, bench: Analysed) -> Grade:
+    def grade(self, own: Reported, bench: Analysed | None = None) -> Grade:
+        """Return the grade of a report, by default with the recordings of the reference."""
+        bench = bench or self._bench
         submission = bench.submission.model_copy(update={"reported": own, "unread": ()})
-        graded = grade_analysis(submission, bench.analysis, rubric=self._rubric, name="simulated")
-        return graded.grade
+        given = {"rubric": self._rubric, "name": "simulated"}
+        return grade_analysis(submission, bench.analysis, **given).grade
 
     # ------------------------------------------------------------------------------ honest
 
@@ -167,7 +165,7 @@ class _Students:
         """Return the grade of a report with one mistake; None if nobody can make it."""
         if code == "data_problem":
             bench = self._with_a_copy(progress)
-            return self._graded(own, bench) if bench else None
+            return self.grade(own, bench) if bench else None
         change = self._changes.get(code, lambda own: self._catalogued(own, code))
         wrong = change(own)
         return self.grade(wrong) if wrong != own else None

@@ -184,8 +184,9 @@ def grade_class(
             late_before = book.days_late()
             changes = book.finish(batch, rubric=now, shown=shown)
             remarks = [
-                *_key_messages(lacking, shown=shown),
-                *_skip_messages(passed, unknown, late_file=options.lateness, hidden=hidden),
+                *_intake_messages(
+                    passed, unknown, lacking, late=options.lateness, hidden=hidden, shown=shown
+                ),
                 *_class_messages(batch, book, shown=shown),
                 *_lateness_messages(
                     {batch.moved.get(name, name): days for name, days in late_before.items()},
@@ -271,26 +272,26 @@ def _without_names(progress: Progress, hand_ins: Sequence[HandIn]) -> Progress:
     return lambda done, total, last: progress(done, total, "" if last in names else last)
 
 
-def _skip_messages(
-    passed: Sequence[str], unknown: Sequence[str], *, late_file: Path | None, hidden: bool
+def _intake_messages(
+    passed: Sequence[str],
+    unknown: Sequence[str],
+    lacking: Sequence[str],
+    *,
+    late: Path | None,
+    hidden: bool,
+    shown: Callable[[str], str],
 ) -> Iterator[str]:
-    """Yield messages about skipped folders and unknown names in the late table."""
+    """Yield messages about skipped folders and about names in the answer key and late table."""
+    if lacking:
+        named = _names(sorted(map(shown, lacking)))
+        yield f"not in the answer key, so judged by their own recordings: {named}"
     if not hidden:
         yield from passed
     elif passed:
         yield f"{count(len(passed), 'folder')} skipped: they look like results of a grading"
-    if unknown and late_file:
+    if unknown and late:
         who = count(len(unknown), "name") if hidden else ", ".join(unknown)
-        yield f"{late_file.name}: no such submission: {who}"
-
-
-def _key_messages(lacking: Sequence[str], *, shown: Callable[[str], str]) -> Iterator[str]:
-    """Yield a message about submissions that the answer key does not name."""
-    if lacking:
-        yield (
-            "not in the answer key, so judged by their own recordings: "
-            f"{_names(sorted(map(shown, lacking)))}"
-        )
+        yield f"{late.name}: no such submission: {who}"
 
 
 def _class_messages(batch: Batch, book: Gradebook, *, shown: Callable[[str], str]) -> Iterator[str]:
@@ -302,7 +303,8 @@ def _class_messages(batch: Batch, book: Gradebook, *, shown: Callable[[str], str
     for before, now in batch.moved.items():
         yield f"{shown(before)} is now called {shown(now)}; its points given by hand are kept"
     for name, before, now in batch.taken_over:
-        whose = "" if hidden else f", {_people(now)} in place of {_people(before)}"
+        people = [listing([quote(author) for author in some]) for some in (now, before)]
+        whose = "" if hidden else f", {' in place of '.join(people)}"
         events = book.history(batch.moved.get(name, name))[1]
         dropped = [e.text for e in events if e.what == "dropped" and e.at == events[-1].at]
         points = f"points by hand no longer count ({dropped[0]}); " if dropped else ""
@@ -341,10 +343,6 @@ def _lateness_messages(
             f"late at the last grading, but not in this run: {_names(sorted(lost))} (if their "
             "days late should still count, grade again with --lateness FILE)"
         )
-
-
-def _people(authors: Sequence[str]) -> str:
-    return listing([quote(author) for author in authors])
 
 
 def _names(names: Sequence[str]) -> str:

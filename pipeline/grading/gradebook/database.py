@@ -153,28 +153,23 @@ class Database:
             try:
                 return work()
             except Lost as error:
-                if time.monotonic() > end:
+                left = end - time.monotonic()
+                if left < 0:
                     raise
-                self._wait(error, end=end)
+                self._waiting(f"{error}; trying again for {left:.0f} s")
+                time.sleep(min(_PAUSE, left))
 
     @contextmanager
     def _transaction(self, engine: Engine) -> Iterator[Connection]:
         """Open a transaction; wait for a server that does not answer."""
-        connection = self._connect(engine)
-        with self._translated(), connection, connection.begin():
-            yield connection
 
-    def _connect(self, engine: Engine) -> Connection:
         def connect() -> Connection:
             with self._translated():
                 return engine.connect()
 
-        return self.repeat(connect)
-
-    def _wait(self, error: "Lost", *, end: float) -> None:
-        left = max(end - time.monotonic(), 0.0)
-        self._waiting(f"{error}; trying again for {left:.0f} s")
-        time.sleep(min(_PAUSE, left))
+        connection = self.repeat(connect)
+        with self._translated(), connection, connection.begin():
+            yield connection
 
     @contextmanager
     def _translated(self) -> Iterator[None]:

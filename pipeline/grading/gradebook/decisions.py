@@ -12,7 +12,7 @@ from pathlib import Path
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.events import TOTAL, Entry, Event
+from pipeline.grading.gradebook.events import TOTAL, Entry, Event, Request
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.tolerance import exact
 from pipeline.grading.words import points_text
@@ -160,8 +160,11 @@ def give(entry: Entry, wanted: WantedPoints) -> Event:
     Raises
     ------
     ConfigError : the criterion does not exist, the points are out of range, or a reason is missing.
+    Conflict : the points have changed since the version that the person saw.
     """
     criterion, points, text = wanted.criterion, wanted.points, wanted.why.strip()
+    if wanted.version:
+        _check_version(entry, criterion, wanted.version)
     if not text:
         raise ConfigError("a change of points needs a reason (--why) and a name (--by)")
     if criterion == TOTAL:
@@ -181,8 +184,13 @@ def give(entry: Entry, wanted: WantedPoints) -> Event:
         # Points that were given once may be restored after a change of the rubric's step.
         if not any((e.criterion, e.points) == (criterion, points) for e in entry.events):
             check_step(points, out_of=out_of[criterion], step=entry.rubric.step)
+    return as_event(wanted, text=text)
+
+
+def as_event(wanted: WantedPoints, *, text: str) -> Event:
+    """Return the event of points, or of a comment, for a criterion."""
     what = "comment" if wanted.comment else "override"
-    return Event(what=what, criterion=criterion, points=points, text=text)
+    return Event(what=what, criterion=wanted.criterion, points=wanted.points, text=text)
 
 
 def change(entry: Entry, wanted: WantedPoints) -> Event:
@@ -203,13 +211,16 @@ def beside(entry: Entry, wanted: WantedPoints) -> WantedPoints:
     return replace(wanted, points=given.points, comment=False)
 
 
-def undo(entry: Entry, criterion: str) -> Event:
+def undo(entry: Entry, criterion: str, *, version: str = "") -> Event:
     """Undo the last change of a criterion; a second call redoes it.
 
     Raises
     ------
     ConfigError : nothing was changed by hand.
+    Conflict : the points have changed since `version`.
     """
+    if version:
+        _check_version(entry, criterion, version)
     changes = entry.changes(criterion)
     if not changes:
         raise ConfigError(f"{criterion}: nothing was changed by hand")
@@ -302,7 +313,9 @@ def ask(entry: Entry, criterion: str, *, why: str) -> Event:
     return Event(what="asked", criterion=criterion, text=text)
 
 
-def answer(entry: Entry, criterion: str, points: float | None, *, text: str) -> list[Event]:
+def answer(
+    entry: Entry, criterion: str, points: float | None, *, text: str, version: str
+) -> list[Event]:
     """Answer a request and, if the points change, set them by hand.
 
     Parameters
@@ -315,8 +328,9 @@ def answer(entry: Entry, criterion: str, points: float | None, *, text: str) -> 
     RequestRefused : the answer is empty or too long, or the request is not waiting.
     ConfigError : the criterion cannot have these points.
     """
+    request = _current_request(entry, criterion, version)
     text = _read_words(text, wanted="write an answer for the students")
-    if entry.requests[criterion].state != "asked":
+    if request.state != "asked":
         raise RequestRefused("this request has an answer already; reopen it to answer again")
     answered = Event(what="answered", criterion=criterion, text=text)
     if points is None or is_unchanged(points, entry.grade, criterion):
@@ -325,16 +339,34 @@ def answer(entry: Entry, criterion: str, points: float | None, *, text: str) -> 
     return [give(entry, wanted), replace(answered, points=points)]
 
 
-def reopen(entry: Entry, criterion: str) -> Event:
+def reopen(entry: Entry, criterion: str, *, version: str) -> Event:
     """Let the students ask once more about a criterion that was answered.
 
     Raises
     ------
     RequestRefused : the request has no answer yet, or is already reopened.
     """
-    if entry.requests[criterion].state != "answered":
+    if _current_request(entry, criterion, version).state != "answered":
         raise RequestRefused("only an answered request can be reopened")
     return Event(what="reopened", criterion=criterion)
+
+
+def _check_version(entry: Entry, criterion: str, version: str) -> None:
+    if version != entry.version(criterion):
+        raise Conflict(
+            f"{criterion}: was changed or graded again after this page was shown",
+            now=entry.given.get(criterion),
+        )
+
+
+def _current_request(entry: Entry, criterion: str, version: str) -> Request:
+    if criterion not in entry.requests:
+        raise ConfigError(f"{criterion}: nobody sent a regrade request")
+    if version != entry.request_version(criterion):
+        raise Conflict(
+            f"{criterion}: was changed after this page was shown", now=entry.given.get(criterion)
+        )
+    return entry.requests[criterion]
 
 
 def points_lost(grade: Grade, rubric: Rubric) -> frozenset[str]:

@@ -143,7 +143,10 @@ def with_overrides(
     for asked in rubric.criteria:
         own = judged.get(asked.id)
         if asked.id in given:
-            own = own or _unjudged(asked.id, asked.title, asked.points)
+            own = own or Criterion(
+                id=asked.id, title=asked.title, outcome="skip", points=0.0, out_of=asked.points,
+                message="Not graded automatically.", expected={}, found={},
+            )  # fmt: skip
             why, manual = overrides[asked.id].text, asked.check == "manual"
             own = _by_hand(own, given[asked.id], why=why, manual=manual)
         if own is not None:
@@ -156,13 +159,6 @@ def with_overrides(
         ),
     }
     return with_total(grade.model_copy(update=changed), criteria, rubric=rubric)
-
-
-def _unjudged(id_: str, title: str, out_of: float) -> Criterion:
-    return Criterion(
-        id=id_, title=title, outcome="skip", points=0.0, out_of=out_of,
-        message="Not graded automatically.", expected={}, found={},
-    )  # fmt: skip
 
 
 def _with_comment(criterion: Criterion, why: str) -> Criterion:

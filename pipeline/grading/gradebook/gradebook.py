@@ -10,46 +10,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, TypeVar
 
 from sqlalchemy import Connection, Row, func, select
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Grade, class_frame, read_grade
-from pipeline.grading.gradebook import decisions
+from pipeline.grading.gradebook import decisions, rows
 from pipeline.grading.gradebook.database import Database
-from pipeline.grading.gradebook.decisions import Conflict, RequestRefused, WantedPoints
+from pipeline.grading.gradebook.decisions import RequestRefused, WantedPoints
 from pipeline.grading.gradebook.events import POINTS, TOTAL, Entry, Event, Request
 from pipeline.grading.gradebook.history import points_changes, read_history, rubric_changes
-from pipeline.grading.gradebook.rows import (
-    GRADING,
-    ClassNow,
-    add_event,
-    add_list,
-    add_row,
-    by_other_rubrics,
-    carry_over,
-    class_list,
-    erase_rows,
-    find_requests,
-    held_criteria,
-    in_class,
-    is_released,
-    known_grading,
-    last_named,
-    lines_of,
-    newest_of,
-    pages,
-    points_of,
-    read_class,
-    read_entries,
-    read_events,
-    read_figures,
-    read_flag,
-    read_gradings,
-    read_prints,
-    read_rubric,
-)
 from pipeline.grading.gradebook.schema import (
     batches,
     entries,
@@ -67,6 +38,7 @@ from pipeline.words.progress import silent
 if TYPE_CHECKING:
     import pandas as pd
 
+T = TypeVar("T")
 State = tuple[int, int, int]
 
 _SUGGESTED = 4  # names of submissions in one suggestion
@@ -162,7 +134,7 @@ class Gradebook:
         def read() -> Grading | None:
             with self._database.reading() as connection:
                 mine = self._assignment or ""
-                return known_grading(connection, key, assignment=mine, drawn=figures)
+                return rows.known_grading(connection, key, assignment=mine, drawn=figures)
 
         return self._database.repeat(read)
 
@@ -185,11 +157,11 @@ class Gradebook:
             )
             if connection.scalar(stored) is not None:
                 return
-            number = add_row(
+            number = rows.add_row(
                 connection,
                 gradings,
                 {
-                    **{name: getattr(grading, name) for name in GRADING},
+                    **{name: getattr(grading, name) for name in rows.GRADING},
                     "submission_id": mine,
                     "at": at,
                     "points": grade.points,
@@ -199,10 +171,10 @@ class Gradebook:
             )
             for position, (name, svg) in enumerate(grading.figures):
                 drawn = {"grading_id": number, "position": position, "name": name, "svg": svg}
-                add_row(connection, figures, drawn)
+                rows.add_row(connection, figures, drawn)
             if grading.findings:
                 kept = {"grading_id": number, "found": grading.findings}
-                add_row(connection, findings, kept)
+                rows.add_row(connection, findings, kept)
 
     def fingerprints(self, numbers: Sequence[int] | None = None) -> Iterator[Grading]:
         """Return all submissions with the fingerprints of their recordings, without repetitions.
@@ -215,7 +187,7 @@ class Gradebook:
         numbers : numbers of the gradings to read, as in `Entry.grading`; default: all gradings that
             have fingerprints.
         """
-        return read_prints(self._database, numbers, assignment=self._assignment or "")
+        return rows.read_prints(self._database, numbers, assignment=self._assignment or "")
 
     def listed(self) -> Iterator[Grading]:
         """Yield the submissions of the current class list, without fingerprints.
@@ -224,8 +196,8 @@ class Gradebook:
         """
         with self._database.reading() as connection:
             last = self._newest(connection)
-            lines = [] if last is None else lines_of(connection, last)
-        return read_gradings(self._database, [line["grading_id"] for line in lines])
+            lines = [] if last is None else rows.lines_of(connection, last)
+        return rows.read_gradings(self._database, [line["grading_id"] for line in lines])
 
     def days_late(self) -> dict[str, float]:
         """Return the days late of each submission on the current class list.
@@ -236,8 +208,8 @@ class Gradebook:
             last = self._newest(connection)
             if last is None:
                 return {}
-            rows = connection.execute(class_list(last, submissions.c.name, gradings.c.days_late))
-            return {row.name: row.days_late for row in rows}
+            late = rows.class_list(last, submissions.c.name, gradings.c.days_late)
+            return {row.name: row.days_late for row in connection.execute(late)}
 
     def finish(
         self, batch: Batch, *, rubric: Rubric, shown: Callable[[str], str] = str
@@ -259,13 +231,13 @@ class Gradebook:
         return self._database.repeat(lambda: self._finish(batch, rubric=rubric, shown=shown))
 
     def _finish(self, batch: Batch, *, rubric: Rubric, shown: Callable[[str], str]) -> list[str]:
-        listed, points, by_hand = [], {}, set()
+        mine, listed, points, by_hand = self._assignment or "", [], {}, set()
         with self._database.changing() as connection:
-            carry_over(connection, batch.moved, assignment=self._assignment or "")
+            rows.carry_over(connection, batch.moved, assignment=mine)
             for position, key in enumerate(batch.keys):
-                row = newest_of(connection, key, assignment=self._assignment or "")
+                row = rows.newest_of(connection, key, assignment=mine)
                 shared = batch.shared.get(row.name)
-                (entry,) = read_entries(connection, [(row, shared)], rubric=rubric)
+                (entry,) = rows.read_entries(connection, [(row, shared)], rubric=rubric)
                 points[row.name] = entry.grade.points
                 by_hand |= {row.name} if entry.overrides or entry.adjustments else set()
                 listed.append(
@@ -279,14 +251,13 @@ class Gradebook:
                     }
                 )
             text, last = rubric.model_dump_json(), self._newest(connection)
-            if last is not None and last.rubric == text and lines_of(connection, last) == listed:
+            if last and last.rubric == text and rows.lines_of(connection, last) == listed:
                 return []
-            mine = self._assignment or ""
-            add_list(connection, listed, assignment=mine, at=self._at(), rubric=text)
+            rows.add_list(connection, listed, assignment=mine, at=self._at(), rubric=text)
             if last is None:
                 return []
             changes = [f"rubric: {change}" for change in rubric_changes(last.rubric, text)]
-            before = points_of(connection, last)
+            before = rows.points_of(connection, last)
             before = {batch.moved.get(name, name): had for name, had in before.items()}
         return changes + points_changes(before, points, by_hand=by_hand, shown=shown)
 
@@ -306,8 +277,7 @@ class Gradebook:
         ------
         ConfigError : no batch is complete yet.
         """
-        with self._database.reading() as connection:
-            return self._last(connection).assignment
+        return self._read(lambda _, last: last.assignment)
 
     @property
     def rubric(self) -> Rubric:
@@ -317,8 +287,7 @@ class Gradebook:
         ------
         ConfigError : no batch is complete yet.
         """
-        with self._database.reading() as connection:
-            return read_rubric(self._last(connection))
+        return self._read(lambda _, last: rows.read_rubric(last))
 
     def entries(self) -> Iterator[Entry]:
         """Yield the entries of the class list in order.
@@ -329,13 +298,13 @@ class Gradebook:
             last = self._last(connection)
             of_batch = select(entries.c.position).where(entries.c.batch_id == last.id)
             positions = sorted(connection.scalars(of_batch))
-        rubric, lines = read_rubric(last), class_list(last)
-        for page in pages(positions):
+        rubric, lines = rows.read_rubric(last), rows.class_list(last)
+        for page in rows.pages(positions):
             with self._database.reading() as connection:
-                rows = connection.execute(lines.where(entries.c.position.in_(page))).all()
-                read = [(row, read_flag(row.shared)) for row in rows]
-                found = read_entries(connection, read, rubric=rubric)
-            yield from found
+                found = rows.read_lines(
+                    connection, lines.where(entries.c.position.in_(page)), rubric=rubric
+                )
+            yield from (entry for _, entry in found)
 
     def shown_entries(self) -> Iterator[Entry]:
         """Yield the entries as students may read them, without criteria that are held back."""
@@ -350,7 +319,7 @@ class Gradebook:
         ConfigError : no submission matches, or several do.
         """
         with self._database.reading() as connection:
-            return self._entry(connection, team)
+            return self._found(connection, team)[1]
 
     def to_frame(self) -> "pd.DataFrame":
         """Return the class list, one row per submission and criterion; see `class_frame`."""
@@ -358,13 +327,12 @@ class Gradebook:
 
     def by_other_rubrics(self) -> list[str]:
         """Return the submissions of the class list that were graded with another rubric."""
-        with self._database.reading() as connection:
-            return by_other_rubrics(connection, self._last(connection))
+        return self._read(rows.by_other_rubrics)
 
     def figures(self, entry: Entry) -> tuple[tuple[str, str], ...]:
         """Return the figures of a submission's feedback, as pairs of file name and SVG text."""
         with self._database.reading() as connection:
-            return read_figures(connection, entry.grading)
+            return rows.read_figures(connection, entry.grading)
 
     def findings(self, entry: Entry) -> str:
         """Return the stored results of a submission's checks; "" if they were not kept."""
@@ -397,8 +365,8 @@ class Gradebook:
             found = [self._find(connection, team) for team in teams]
             gone = {row.submission_id: row.name for _, row in found}
             last = self._last(connection)
-            left = [e for e in lines_of(connection, last) if e["submission_id"] not in gone]
-            add_list(
+            left = [e for e in rows.lines_of(connection, last) if e["submission_id"] not in gone]
+            rows.add_list(
                 connection,
                 [{**line, "position": i} for i, line in enumerate(left)],
                 assignment=last.assignment,
@@ -418,7 +386,7 @@ class Gradebook:
         with self._database.erasing() as connection:
             found = [self._find_ever(connection, team) for team in teams]
             gone = {row.submission_id: row.name for row in found}
-            erase_rows(connection, gone)
+            rows.erase_rows(connection, gone)
         return list(gone.values())
 
     def state(self) -> State:
@@ -429,15 +397,14 @@ class Gradebook:
             newest = connection.scalar(select(func.max(events.c.id)))
             return last, newest or 0, connection.scalar(mine) or 0
 
-    def class_now(self, before: ClassNow | None = None) -> ClassNow:
+    def class_now(self, before: rows.ClassNow | None = None) -> rows.ClassNow:
         """Return the class with current grades.
 
         Parameters
         ----------
         before : an earlier result, whose unchanged entries are reused.
         """
-        with self._database.reading() as connection:
-            return read_class(connection, self._last(connection), before)
+        return self._read(lambda connection, last: rows.read_class(connection, last, before))
 
     # ------------------------------------------------------------------ what people do
 
@@ -486,11 +453,7 @@ class Gradebook:
             submission=team, criterion=criterion, points=points, why=why, version=version
         )
 
-        def decide(entry: Entry) -> list[Event]:
-            _check_version(entry, wanted)
-            return [decisions.change(entry, wanted)]
-
-        return self._decide(team, decide, by=by)[0]
+        return self._decide(team, lambda entry: [decisions.change(entry, wanted)], by=by)[0]
 
     def undo(self, team: str, criterion: str, *, by: str, version: str) -> Event:
         """Undo the last change of a criterion; a second call redoes it.
@@ -499,15 +462,9 @@ class Gradebook:
         ------
         Conflict : see `change`.
         """
-        wanted = WantedPoints(
-            submission=team, criterion=criterion, points=None, why="", version=version
-        )
-
-        def decide(entry: Entry) -> list[Event]:
-            _check_version(entry, wanted)
-            return [decisions.undo(entry, criterion)]
-
-        return self._decide(team, decide, by=by)[0]
+        return self._decide(
+            team, lambda entry: [decisions.undo(entry, criterion, version=version)], by=by
+        )[0]
 
     def change_all(self, wishes: Sequence[WantedPoints], *, by: str) -> BulkChange:
         """Give points by hand to several submissions; if one change is refused, all are.
@@ -525,14 +482,14 @@ class Gradebook:
                 if wish.submission not in known:
                     raise ConfigError(f"{where}no such submission is in the class")
                 row, entry = known[wish.submission]
-                if wish.version:
-                    _check_version(entry, wish)
                 try:
                     event = decisions.give(entry, decisions.beside(entry, wish))
                     if decisions.is_repeated(entry, event):
                         continue
                     stored = self._store(connection, row, [event], by=by, at=at)
                 except ConfigError as error:
+                    if not where:
+                        raise
                     raise ConfigError(f"{where}{error}") from None
                 known[wish.submission] = row, entry.after(*stored)
                 new += 1
@@ -548,13 +505,9 @@ class Gradebook:
         found = []
         for wish in wishes:
             if wish.submission in known:
-                entry = known[wish.submission][1]
+                _, entry = known[wish.submission]
                 asked = decisions.beside(entry, wish)
-                what = "comment" if asked.comment else "override"
-                event = Event(
-                    what=what, criterion=asked.criterion, points=asked.points, text=asked.why
-                )
-                found.append((entry, entry.after(event)))
+                found.append((entry, entry.after(decisions.as_event(asked, text=asked.why))))
         return found
 
     def undo_all(self, at: str, *, by: str) -> BulkChange:
@@ -569,7 +522,7 @@ class Gradebook:
         """
         now, back, kept = self._at(), 0, []
         with self._database.changing() as connection:
-            members = in_class(self._last(connection))
+            members = rows.in_class(self._last(connection))
             mine = events.c.at == at, events.c.submission_id.in_(members), events.c.what.in_(POINTS)
             chosen = (
                 select(submissions.c.name, events.c.id, events.c.criterion)
@@ -597,7 +550,7 @@ class Gradebook:
         least : smallest number of submissions that counts as several.
         """
         with self._database.reading() as connection:
-            members = in_class(self._last(connection))
+            members = rows.in_class(self._last(connection))
             columns = events.c.at, events.c.by
             teams = func.count(events.c.submission_id.distinct())
             mine = (
@@ -640,13 +593,9 @@ class Gradebook:
     def changes_since(self, number: int) -> list[tuple[str, Event]]:
         """Return the points given by hand after the event `number`, with their submissions."""
         with self._database.reading() as connection:
-            mine = self._last(connection).assignment
-            found = read_events(
-                connection,
-                events.c.id > number,
-                events.c.assignment == mine,
-                events.c.what.in_(POINTS),
-            )
+            mine = events.c.assignment == self._last(connection).assignment
+            given = events.c.id > number, events.c.what.in_(POINTS)
+            found = rows.read_events(connection, mine, *given)
             named = select(submissions.c.id, submissions.c.name).where(submissions.c.id.in_(found))
             names = {row.id: row.name for row in connection.execute(named)}
         new = [(names[key], event) for key, own in found.items() for event in own]
@@ -675,8 +624,7 @@ class Gradebook:
     @property
     def released(self) -> bool:
         """Whether students may read the feedback of the class."""
-        with self._database.reading() as connection:
-            return is_released(connection, self._last(connection).assignment)
+        return self._read(lambda connection, last: rows.is_released(connection, last.assignment))
 
     def release(self, released: bool, *, by: str) -> list[str]:
         """Let students read the feedback of the class, or hide it again.
@@ -685,12 +633,12 @@ class Gradebook:
         """
         with self._database.changing() as connection:
             last, at = self._last(connection), self._at()
-            class_now = read_class(connection, last, None).entries if released else []
+            class_now = rows.read_class(connection, last, None).entries if released else []
             open_ = [entry.submission for entry in class_now if entry.has_open_case]
             for row, _ in self._named(connection, open_).values():
                 self._store(connection, row, [Event(what="held", text=_OPEN_CASE)], by=by, at=at)
             event = Event(what="released" if released else "hidden", by=by, at=at)
-            add_event(connection, event, assignment=last.assignment)
+            rows.add_event(connection, event, assignment=last.assignment)
         return open_
 
     def hold(self, team: str, *, why: str, by: str) -> None:
@@ -714,8 +662,7 @@ class Gradebook:
     @property
     def held_criteria(self) -> tuple[str, ...]:
         """The criteria of the rubric that are held back for the whole class."""
-        with self._database.reading() as connection:
-            return held_criteria(connection, self._last(connection))
+        return self._read(rows.held_criteria)
 
     def hold_criterion(self, criterion: str, held: bool, *, why: str = "", by: str) -> None:
         """Hold a criterion back for the whole class, or no longer.
@@ -729,34 +676,33 @@ class Gradebook:
         """
         with self._database.changing() as connection:
             last = self._last(connection)
-            before = held_criteria(connection, last)
-            event = decisions.hold_criterion(criterion, held, before, read_rubric(last), why=why)
+            before = rows.held_criteria(connection, last)
+            event = decisions.hold_criterion(
+                criterion, held, before, rows.read_rubric(last), why=why
+            )
             event = replace(event, by=by.strip(), at=self._at())
-            add_event(connection, event, assignment=last.assignment)
+            rows.add_event(connection, event, assignment=last.assignment)
 
     def n_waiting(self) -> int:
         """Return the number of requests of the class that wait for an answer."""
         with self._database.reading() as connection:
             last = self._newest(connection)
-            return 0 if last is None else len(find_requests(connection, last)[0])
+            return 0 if last is None else len(rows.find_requests(connection, last)[0])
 
     def queue(self, of: str = "") -> Queue:
         """Return the requests of the class, or only those of the submission `of`."""
         with self._database.reading() as connection:
             waiting, settled = (
-                [(row.name, row.criterion) for row in rows if not of or row.name == of]
-                for rows in find_requests(connection, self._last(connection))
+                [row for row in every if not of or row.name == of]
+                for every in rows.find_requests(connection, self._last(connection))
             )
-            shown = [*waiting[:_MOST_SHOWN], *settled[:_MOST_SHOWN]]
-            known = self._named(connection, [name for name, _ in shown])
-        queued = [(known[name][1], known[name][1].requests[criterion]) for name, criterion in shown]
-        n_first = len(waiting[:_MOST_SHOWN])
-        return Queue(
-            waiting=queued[:n_first],
-            settled=queued[n_first:],
-            n_waiting=len(waiting),
-            n_settled=len(settled),
+            shown = waiting[:_MOST_SHOWN], settled[:_MOST_SHOWN]
+            known = self._named(connection, [row.name for some in shown for row in some])
+        first, last = (
+            [(known[row.name][1], known[row.name][1].requests[row.criterion]) for row in some]
+            for some in shown
         )
+        return Queue(waiting=first, settled=last, n_waiting=len(waiting), n_settled=len(settled))
 
     def own_feedback(self, submission: str, *, assignment: str = "") -> Entry | None:
         """Return what the authors of a submission may read; None until the feedback is released.
@@ -776,7 +722,7 @@ class Gradebook:
         with self._database.reading() as connection:
             if not self._is_readable(connection, assignment):
                 return None
-            entry = self._entry(connection, submission, exact=True)
+            _, entry = self._found(connection, submission, exact=True)
             return None if entry.hold else entry
 
     def ask(
@@ -788,11 +734,12 @@ class Gradebook:
         ------
         RequestRefused : no request is possible for this criterion now.
         """
-
-        def decide(entry: Entry) -> list[Event]:
-            return [decisions.ask(entry, criterion, why=why)]
-
-        self._decide(submission, decide, by=by, released=assignment)
+        self._decide(
+            submission,
+            lambda entry: [decisions.ask(entry, criterion, why=why)],
+            by=by,
+            released=assignment,
+        )
 
     def answer(
         self,
@@ -814,12 +761,10 @@ class Gradebook:
         ------
         Conflict : somebody else answered or changed the points, or the submission was graded again.
         """
-
-        def decide(entry: Entry) -> list[Event]:
-            _check_request(entry, criterion, version)
-            return decisions.answer(entry, criterion, points, text=text)
-
-        self._decide(submission, decide, by=by)
+        given = {"text": text, "version": version}
+        self._decide(
+            submission, lambda entry: decisions.answer(entry, criterion, points, **given), by=by
+        )
 
     def reopen(self, submission: str, criterion: str, *, by: str, version: str) -> None:
         """Let the students ask once more about a criterion that was answered.
@@ -828,12 +773,9 @@ class Gradebook:
         ------
         Conflict : see `answer`.
         """
-
-        def decide(entry: Entry) -> list[Event]:
-            _check_request(entry, criterion, version)
-            return [decisions.reopen(entry, criterion)]
-
-        self._decide(submission, decide, by=by)
+        self._decide(
+            submission, lambda entry: [decisions.reopen(entry, criterion, version=version)], by=by
+        )
 
     # ----------------------------------------------------------------------- helpers
 
@@ -867,25 +809,18 @@ class Gradebook:
             if decided[0].what in POINTS:
                 raise ConfigError("a change of points needs a reason (--why) and a name (--by)")
             raise RequestRefused("enter your name: requests, answers and reviews are signed")
-        authors = row.authors or last_named(connection, row.submission_id)
+        authors = row.authors or rows.last_named(connection, row.submission_id)
         signed = [replace(event, by=by.strip(), at=at, authors=authors) for event in decided]
-        of = connection.scalar(
-            select(submissions.c.assignment).where(submissions.c.id == row.submission_id)
-        )
-        return [
-            add_event(connection, event, assignment=of or "", submission=row.submission_id)
-            for event in signed
-        ]
+        own = select(submissions.c.assignment).where(submissions.c.id == row.submission_id)
+        place = {"assignment": connection.scalar(own) or "", "submission": row.submission_id}
+        return [rows.add_event(connection, event, **place) for event in signed]
 
     def _is_readable(self, connection: Connection, assignment: str) -> bool:
         """Return whether students may read the class list, and it is of this assignment."""
         last = self._newest(connection)
         if last is None or assignment not in ("", last.assignment):
             return False
-        return is_released(connection, last.assignment)
-
-    def _entry(self, connection: Connection, team: str, *, exact: bool = False) -> Entry:
-        return self._found(connection, team, exact=exact)[1]
+        return rows.is_released(connection, last.assignment)
 
     def _found(
         self, connection: Connection, team: str, *, exact: bool = False
@@ -900,18 +835,22 @@ class Gradebook:
         last, row = self._find(connection, team)
         if exact and row.name != team:
             raise ConfigError(f"{team}: is not the name of a submission")
-        line = row, read_flag(row.shared)
-        (entry,) = read_entries(connection, [line], rubric=read_rubric(last))
-        held = held_criteria(connection, last) if exact else ()
+        line = row, rows.read_flag(row.shared)
+        (entry,) = rows.read_entries(connection, [line], rubric=rows.read_rubric(last))
+        held = rows.held_criteria(connection, last) if exact else ()
         return row, entry.without(held)
 
     def _named(self, connection: Connection, names: Sequence[str]) -> dict[str, tuple[Row, Entry]]:
         """Return the lines of the class list with these names, and what they say now."""
         last = self._last(connection)
-        mine = class_list(last).where(submissions.c.name.in_(set(names)))
-        lines = [(row, read_flag(row.shared)) for row in connection.execute(mine).all()]
-        found = read_entries(connection, lines, rubric=read_rubric(last))
-        return {row.name: (row, entry) for (row, _), entry in zip(lines, found, strict=True)}
+        mine = rows.class_list(last).where(submissions.c.name.in_(set(names)))
+        found = rows.read_lines(connection, mine, rubric=rows.read_rubric(last))
+        return {row.name: (row, entry) for row, entry in found}
+
+    def _read(self, read: Callable[[Connection, Row], T]) -> T:
+        """Return what `read` reads of the last complete batch."""
+        with self._database.reading() as connection:
+            return read(connection, self._last(connection))
 
     def _at(self) -> str:
         return self._now().astimezone(UTC).isoformat(timespec="microseconds")
@@ -920,7 +859,7 @@ class Gradebook:
         values = {"assignment": self._assignment or "", "name": name}
         mine = select(submissions.c.id).filter_by(**values)
         number = connection.scalar(mine)
-        return add_row(connection, submissions, values) if number is None else number
+        return rows.add_row(connection, submissions, values) if number is None else number
 
     def _last(self, connection: Connection) -> Row:
         row = self._newest(connection)
@@ -934,15 +873,15 @@ class Gradebook:
     def _find(self, connection: Connection, team: str) -> tuple[Row, Row]:
         """Return the last complete batch and, from its class list, the line of a team."""
         last = self._last(connection)
-        names = class_list(last, submissions.c.name, gradings.c.authors)
-        rows = connection.execute(names).all()
-        found = [row.position for row in _named(team, rows)]
+        names = rows.class_list(last, submissions.c.name, gradings.c.authors)
+        listed = connection.execute(names).all()
+        found = [row.position for row in _named(team, listed)]
         if len(found) != 1:
-            hint = f"no such submission{_similar(team, [row.name for row in rows])}"
+            hint = f"no such submission{_similar(team, [row.name for row in listed])}"
             raise ConfigError(
                 f"{team}: {'is in several submissions: give the name of one' if found else hint}"
             )
-        line = class_list(last).where(entries.c.position == found[0])
+        line = rows.class_list(last).where(entries.c.position == found[0])
         return last, connection.execute(line).one()
 
     def _find_ever(self, connection: Connection, team: str) -> Row:
@@ -976,24 +915,7 @@ def _similar(team: str, names: Sequence[str]) -> str:
     return f"; did you mean {' or '.join(ends[:_SUGGESTED])}?" if ends else nearest(team, names)
 
 
-def _named(team: str, rows: Sequence[Row]) -> list[Row]:
+def _named(team: str, listed: Sequence[Row]) -> list[Row]:
     """Return the rows named `team`; if no row is, those with `team` among the authors."""
-    exact = [row for row in rows if row.name == team]
-    return exact or [row for row in rows if person(team) in map(person, row.authors)]
-
-
-def _check_version(entry: Entry, wanted: WantedPoints) -> None:
-    if wanted.version != entry.version(wanted.criterion):
-        raise Conflict(
-            f"{wanted.criterion}: was changed or graded again after this page was shown",
-            now=entry.given.get(wanted.criterion),
-        )
-
-
-def _check_request(entry: Entry, criterion: str, version: str) -> None:
-    if criterion not in entry.requests:
-        raise ConfigError(f"{criterion}: nobody sent a regrade request")
-    if version != entry.request_version(criterion):
-        raise Conflict(
-            f"{criterion}: was changed after this page was shown", now=entry.given.get(criterion)
-        )
+    exact = [row for row in listed if row.name == team]
+    return exact or [row for row in listed if person(team) in map(person, row.authors)]

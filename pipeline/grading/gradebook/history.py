@@ -208,36 +208,34 @@ def to_the_second(at: str) -> str:
     return datetime.fromisoformat(at).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
+_WORDS = {  # of events without points
+    "adjusted": "total {points:+g} points, by {by}: {text}",
+    "comment": "{criterion}: by {by}: {text}",
+    "removed": "{text}",
+    "dropped": "given to earlier authors, no longer counts: {text}",
+    "restored": "given to these authors, counts again: {text}",
+}
+
+
 def event_words(event: Event) -> str:
     """Return an event as one line of text, with points, person and reason."""
-    if event.what == "override":
-        points = "automatic points again" if event.points is None else f"{event.points:g} by hand"
-        return f"override  {event.criterion}: {points}, by {event.by}: {event.text}"
-    if event.what == "adjusted":
-        return f"adjusted  total {event.points:+g} points, by {event.by}: {event.text}"
-    if event.what == "comment":
-        return f"comment   {event.criterion}: by {event.by}: {event.text}"
-    if event.what == "removed":
-        return f"removed   {event.text}"
-    if event.what == "dropped":
-        return f"dropped   given to earlier authors, no longer counts: {event.text}"
-    if event.what == "restored":
-        return f"restored  given to these authors, counts again: {event.text}"
-    if event.what in HOLDS:
-        what = "held back" if event.what == "held" else "let go"
-        return f"{what:8}  by {event.by}" + (f": {event.text}" if event.text else "")
-    if event.what in ("asked", "answered", "reopened"):
-        return _request_words(event)
-    note = f"  ({event.text})" if event.text else ""
-    return f"{event.what:8}  {event.points:g} of {event.out_of:g}{note}"
-
-
-def _request_words(event: Event) -> str:
-    """Return an event of a request as one line of text."""
-    by = f"by {event.by}" if event.by else "by the team"
-    points = "" if event.points is None else f"{event.points:g} by hand, "
-    text = " ".join(event.text.split())
-    return f"{event.what:8}  {event.criterion}: {points}{by}" + (f": {text}" if text else "")
+    what, given = event.what, "" if event.points is None else f"{event.points:g} by hand"
+    if what in _WORDS:
+        said = _WORDS[what].format_map(vars(event))
+    elif what == "override":
+        points = given or "automatic points again"
+        said = f"{event.criterion}: {points}, by {event.by}: {event.text}"
+    elif what in HOLDS:
+        what = "held back" if what == "held" else "let go"
+        said = f"by {event.by}" + (f": {event.text}" if event.text else "")
+    elif what in REQUESTS:
+        points = f"{given}, " if given else ""
+        text = " ".join(event.text.split())
+        by = event.by or "the team"
+        said = f"{event.criterion}: {points}by {by}" + (f": {text}" if text else "")
+    else:
+        said = f"{event.points:g} of {event.out_of:g}" + (f"  ({event.text})" if event.text else "")
+    return f"{what:8}  {said}"
 
 
 def rubric_changes(before: str, now: str) -> list[str]:

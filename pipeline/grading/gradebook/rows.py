@@ -8,19 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
+import sqlalchemy as sa
 from pydantic import ValidationError
-from sqlalchemy import (
-    ColumnElement,
-    Connection,
-    Row,
-    Select,
-    Table,
-    delete,
-    func,
-    insert,
-    select,
-    update,
-)
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, read_grade
@@ -47,7 +36,7 @@ _EVENT = [
     for f in fields(Event)
     if f.name != "out_of"
 ]
-_OF_GRADING = select(submissions.c.name.label("submission"), *(gradings.c[x] for x in GRADING))
+_OF_GRADING = sa.select(submissions.c.name.label("submission"), *(gradings.c[x] for x in GRADING))
 _BRIEF = (
     submissions.c.name.label("submission"),
     gradings.c.authors,
@@ -57,9 +46,9 @@ _BRIEF = (
 )
 
 
-def add_row(connection: Connection, table: Table, values: dict) -> int:
+def add_row(connection: sa.Connection, table: sa.Table, values: dict) -> int:
     """Add a row and return its number."""
-    key = connection.execute(insert(table).values(values)).inserted_primary_key
+    key = connection.execute(sa.insert(table).values(values)).inserted_primary_key
     assert key is not None
     return key[0]
 
@@ -69,7 +58,7 @@ def pages(numbers: Sequence[int]) -> Iterator[Sequence[int]]:
     return (numbers[i : i + _PAGE] for i in range(0, len(numbers), _PAGE))
 
 
-def _newest(chosen: Select, key: str, *, assignment: str) -> Select:
+def _newest(chosen: sa.Select, key: str, *, assignment: str) -> sa.Select:
     """Return the query for the newest grading with a key in an assignment.
 
     The key alone is not enough, because two assignments may have rubrics with the same text.
@@ -82,7 +71,7 @@ def _newest(chosen: Select, key: str, *, assignment: str) -> Select:
 
 
 def known_grading(
-    connection: Connection, key: str, *, assignment: str, drawn: bool
+    connection: sa.Connection, key: str, *, assignment: str, drawn: bool
 ) -> Grading | None:
     """Return the newest grading with this key, or None.
 
@@ -96,15 +85,15 @@ def known_grading(
     return Grading(**own, figures=read_figures(connection, row["id"]) if drawn else ())
 
 
-def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str], ...]:
+def read_figures(connection: sa.Connection, grading: int) -> tuple[tuple[str, str], ...]:
     """Return the figures of a grading, as pairs of file name and SVG text."""
-    mine = select(figures.c.name, figures.c.svg).where(figures.c.grading_id == grading)
+    mine = sa.select(figures.c.name, figures.c.svg).where(figures.c.grading_id == grading)
     return tuple((name, svg) for name, svg in connection.execute(mine.order_by(figures.c.position)))
 
 
 def read_gradings(database: Database, numbers: Sequence[int]) -> Iterator[Grading]:
     """Yield the gradings with these numbers, without texts and fingerprints."""
-    lines = select(*_BRIEF).join(submissions).order_by(gradings.c.id)
+    lines = sa.select(*_BRIEF).join(submissions).order_by(gradings.c.id)
     for page in pages(numbers):
         with database.reading() as connection:
             rows = connection.execute(lines.where(gradings.c.id.in_(page))).mappings().all()
@@ -121,12 +110,12 @@ def read_prints(
     numbers : numbers of the gradings to read; default: all gradings that have fingerprints.
     assignment : assignment whose submissions have `of_class` set.
     """
-    chosen = select(*_BRIEF, gradings.c.fingerprints, submissions.c.assignment)
+    chosen = sa.select(*_BRIEF, gradings.c.fingerprints, submissions.c.assignment)
     chosen = chosen.join(submissions).order_by(gradings.c.id)
     if numbers is None:
         chosen = chosen.where(gradings.c.fingerprints != b"")
         with database.reading() as connection:
-            numbers = sorted(connection.scalars(select(gradings.c.id)))
+            numbers = sorted(connection.scalars(sa.select(gradings.c.id)))
     seen = set()
     for page in pages(numbers):
         with database.reading() as connection:
@@ -153,21 +142,21 @@ _ENTRY = (
 )
 
 
-def newest_of(connection: Connection, key: str, *, assignment: str) -> Row:
+def newest_of(connection: sa.Connection, key: str, *, assignment: str) -> sa.Row:
     """Return the newest grading with a key in an assignment.
 
     Raises
     ------
     KeyError : the key has no grading.
     """
-    newest = _newest(select(*_ENTRY).join(submissions), key, assignment=assignment)
+    newest = _newest(sa.select(*_ENTRY).join(submissions), key, assignment=assignment)
     row = connection.execute(newest).one_or_none()
     if row is None:
         raise KeyError(key)
     return row
 
 
-def class_list(batch: Row, *columns: ColumnElement) -> Select:
+def class_list(batch: sa.Row, *columns: sa.ColumnElement) -> sa.Select:
     """Return the query for the lines of a class list, in order.
 
     Parameters
@@ -177,13 +166,13 @@ def class_list(batch: Row, *columns: ColumnElement) -> Select:
     joined = entries.join(gradings, entries.c.grading_id == gradings.c.id).join(
         submissions, entries.c.submission_id == submissions.c.id
     )
-    chosen = select(*(columns or _ENTRY), entries.c.position, entries.c.shared)
+    chosen = sa.select(*(columns or _ENTRY), entries.c.position, entries.c.shared)
     mine = chosen.select_from(joined).where(entries.c.batch_id == batch.id)
     return mine.order_by(entries.c.position)
 
 
 def read_entries(
-    connection: Connection, lines: Sequence[tuple[Row, Flag | None]], *, rubric: Rubric
+    connection: sa.Connection, lines: Sequence[tuple[sa.Row, Flag | None]], *, rubric: Rubric
 ) -> list[Entry]:
     """Return lines of the class list as they stand now, in two queries.
 
@@ -206,6 +195,15 @@ def read_entries(
     ]
 
 
+def read_lines(
+    connection: sa.Connection, chosen: sa.Select, *, rubric: Rubric
+) -> list[tuple[sa.Row, Entry]]:
+    """Return the lines that a query of `class_list` chooses, each as row and as entry."""
+    found = connection.execute(chosen).all()
+    lines = [(row, read_flag(row.shared)) for row in found]
+    return list(zip(found, read_entries(connection, lines, rubric=rubric), strict=True))
+
+
 @dataclass(frozen=True, kw_only=True)
 class ClassNow:
     """The class list with current grades.
@@ -225,7 +223,7 @@ class ClassNow:
         return list(self.made_of.values())
 
 
-def read_class(connection: Connection, batch: Row, before: ClassNow | None) -> ClassNow:
+def read_class(connection: sa.Connection, batch: sa.Row, before: ClassNow | None) -> ClassNow:
     """Return a class list with current grades, with the unchanged entries of an earlier result."""
     rubric, members = read_rubric(batch), in_class(batch)
     done = read_events(connection, events.c.submission_id.in_(members))
@@ -255,7 +253,7 @@ def read_class(connection: Connection, batch: Row, before: ClassNow | None) -> C
 
 
 def read_entry(
-    row: Row,
+    row: sa.Row,
     done: Sequence[Event],
     *,
     shared: Flag | None,
@@ -277,10 +275,10 @@ def read_entry(
     )
 
 
-def read_events(connection: Connection, *where: ColumnElement) -> dict[int, list[Event]]:
+def read_events(connection: sa.Connection, *where: sa.ColumnElement) -> dict[int, list[Event]]:
     """Return the events of submissions that meet the conditions, by submission, oldest first."""
     found: dict[int, list[Event]] = defaultdict(list)
-    mine = select(events.c.submission_id, *_EVENT).where(*where).order_by(events.c.id)
+    mine = sa.select(events.c.submission_id, *_EVENT).where(*where).order_by(events.c.id)
     for row in connection.execute(mine).mappings():
         values = dict(row)
         number = values.pop("submission_id")
@@ -288,21 +286,21 @@ def read_events(connection: Connection, *where: ColumnElement) -> dict[int, list
     return found
 
 
-def first_keys(connection: Connection, submitted: Iterable[int] | Select) -> dict[int, str]:
+def first_keys(connection: sa.Connection, submitted: Iterable[int] | sa.Select) -> dict[int, str]:
     """Return the key of each submission's first version, by submission number."""
-    firsts = select(func.min(gradings.c.id)).where(gradings.c.submission_id.in_(submitted))
+    firsts = sa.select(sa.func.min(gradings.c.id)).where(gradings.c.submission_id.in_(submitted))
     firsts = firsts.group_by(gradings.c.submission_id)
-    keys = select(gradings.c.submission_id, gradings.c.key).where(gradings.c.id.in_(firsts))
+    keys = sa.select(gradings.c.submission_id, gradings.c.key).where(gradings.c.id.in_(firsts))
     return {row.submission_id: row.key for row in connection.execute(keys)}
 
 
-def find_requests(connection: Connection, batch: Row) -> tuple[list[Row], list[Row]]:
+def find_requests(connection: sa.Connection, batch: sa.Row) -> tuple[list[sa.Row], list[sa.Row]]:
     """Return the newest event of each request in a class, in two lists: waiting and settled.
 
     Each row has its number `id`, the `criterion`, and the `submission_id` and `position` of its
     submission. Waiting requests come oldest first, settled ones newest first.
     """
-    newest = select(func.max(events.c.id)).where(events.c.what.in_(REQUESTS))
+    newest = sa.select(sa.func.max(events.c.id)).where(events.c.what.in_(REQUESTS))
     newest = newest.group_by(events.c.submission_id, events.c.criterion)
     joined = (
         events.join(entries, entries.c.submission_id == events.c.submission_id)
@@ -319,24 +317,24 @@ def find_requests(connection: Connection, batch: Row) -> tuple[list[Row], list[R
         gradings.c.authors,
         submissions.c.name,
     )
-    mine = select(*columns).select_from(joined).where(entries.c.batch_id == batch.id)
+    mine = sa.select(*columns).select_from(joined).where(entries.c.batch_id == batch.id)
     found = connection.execute(mine.where(events.c.id.in_(newest)).order_by(events.c.id)).all()
     theirs = [row for row in found if same_people(row.asked_by, row.authors)]
     waiting = [row for row in theirs if row.what == "asked"]
     return waiting, [row for row in reversed(theirs) if row.what != "asked"]
 
 
-def is_released(connection: Connection, assignment: str) -> bool:
+def is_released(connection: sa.Connection, assignment: str) -> bool:
     """Return whether students may read the feedback of an assignment."""
-    mine = select(events.c.what).where(
+    mine = sa.select(events.c.what).where(
         events.c.assignment == assignment, events.c.what.in_(("released", "hidden"))
     )
     return connection.scalar(mine.order_by(events.c.id.desc()).limit(1)) == "released"
 
 
-def held_criteria(connection: Connection, batch: Row) -> tuple[str, ...]:
+def held_criteria(connection: sa.Connection, batch: sa.Row) -> tuple[str, ...]:
     """Return the criteria of a class list's rubric that are held back."""
-    mine = select(events.c.criterion, events.c.what).where(
+    mine = sa.select(events.c.criterion, events.c.what).where(
         events.c.assignment == batch.assignment,
         events.c.submission_id.is_(None),
         events.c.what.in_(HOLDS),
@@ -346,7 +344,7 @@ def held_criteria(connection: Connection, batch: Row) -> tuple[str, ...]:
 
 
 def add_event(
-    connection: Connection, event: Event, *, assignment: str, submission: int | None = None
+    connection: sa.Connection, event: Event, *, assignment: str, submission: int | None = None
 ) -> Event:
     """Store an event; return it with its number."""
     values = asdict(event)
@@ -356,43 +354,43 @@ def add_event(
     return replace(event, id=add_row(connection, events, {**values, **place}))
 
 
-def lines_of(connection: Connection, batch: Row) -> list[dict]:
+def lines_of(connection: sa.Connection, batch: sa.Row) -> list[dict]:
     """Return the lines of a class list as dictionaries, ready for `add_list`."""
     columns = [column for column in entries.c if column.name != "batch_id"]
-    mine = select(*columns).where(entries.c.batch_id == batch.id).order_by(entries.c.position)
+    mine = sa.select(*columns).where(entries.c.batch_id == batch.id).order_by(entries.c.position)
     return [dict(row._mapping) for row in connection.execute(mine)]
 
 
-def points_of(connection: Connection, batch: Row) -> dict[str, float]:
+def points_of(connection: sa.Connection, batch: sa.Row) -> dict[str, float]:
     """Return the points of each submission in a class list."""
     rows = connection.execute(class_list(batch, submissions.c.name, entries.c.points))
     return {row.name: row.points for row in rows}
 
 
 def add_list(
-    connection: Connection, lines: list[dict], *, assignment: str, at: str, rubric: str
+    connection: sa.Connection, lines: list[dict], *, assignment: str, at: str, rubric: str
 ) -> None:
     """Store a class list."""
     values = {"assignment": assignment, "at": at, "rubric": rubric}
     number = add_row(connection, batches, values)
     if lines:
-        connection.execute(insert(entries), [{**line, "batch_id": number} for line in lines])
+        connection.execute(sa.insert(entries), [{**line, "batch_id": number} for line in lines])
 
 
-def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
+def by_other_rubrics(connection: sa.Connection, batch: sa.Row) -> list[str]:
     """Return the submissions of a class list that were graded with a different rubric.
 
     A grading was made with the rubric of the first class list that contains it.
     """
-    mine = select(entries.c.grading_id).where(entries.c.batch_id == batch.id)
+    mine = sa.select(entries.c.grading_id).where(entries.c.batch_id == batch.id)
     first = (
-        select(entries.c.grading_id, func.min(entries.c.batch_id).label("batch_id"))
+        sa.select(entries.c.grading_id, sa.func.min(entries.c.batch_id).label("batch_id"))
         .where(entries.c.grading_id.in_(mine))
         .group_by(entries.c.grading_id)
         .subquery()
     )
     joined = (
-        select(submissions.c.name, batches.c.rubric)
+        sa.select(submissions.c.name, batches.c.rubric)
         .select_from(first)
         .join(batches, batches.c.id == first.c.batch_id)
         .join(gradings, gradings.c.id == first.c.grading_id)
@@ -410,20 +408,20 @@ def _relevant_parts(rubric: str) -> dict:
     return json.loads(rubric) | {"title": "", "anonymous": False}
 
 
-def last_named(connection: Connection, submission: int) -> tuple[str, ...]:
+def last_named(connection: sa.Connection, submission: int) -> tuple[str, ...]:
     """Return the last known authors of a submission; its newest version may name none."""
-    named = select(gradings.c.authors).where(
+    named = sa.select(gradings.c.authors).where(
         gradings.c.submission_id == submission, gradings.c.authors != ()
     )
     return connection.scalar(named.order_by(gradings.c.id.desc()).limit(1)) or ()
 
 
-def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: str) -> None:
+def carry_over(connection: sa.Connection, moved: Mapping[str, str], *, assignment: str) -> None:
     """Copy what people did to renamed submissions to their new names.
 
     Rows that already exist under the new name are not copied again if a name changes back.
     """
-    named = select(submissions.c.name, submissions.c.id).where(
+    named = sa.select(submissions.c.name, submissions.c.id).where(
         submissions.c.assignment == assignment,
         submissions.c.name.in_([*moved, *moved.values()]),
     )
@@ -431,7 +429,7 @@ def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: 
     columns = [column for column in events.c if column.name not in ("id", "submission_id")]
     there = {}
     for name, number in numbers.items():
-        mine = select(*columns).where(
+        mine = sa.select(*columns).where(
             events.c.submission_id == number, events.c.grading_id.is_(None)
         )
         there[name] = [
@@ -443,9 +441,9 @@ def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: 
                 add_row(connection, events, {**values, "submission_id": numbers[new]})
 
 
-def in_class(batch: Row) -> Select:
+def in_class(batch: sa.Row) -> sa.Select:
     """Return the query for the numbers of the submissions on a class list."""
-    return select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
+    return sa.select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
 
 
 def read_flag(text: str) -> Flag | None:
@@ -453,7 +451,7 @@ def read_flag(text: str) -> Flag | None:
     return Flag.model_validate_json(text) if text else None
 
 
-def read_rubric(batch: Row) -> Rubric:
+def read_rubric(batch: sa.Row) -> Rubric:
     """Return the rubric of a batch.
 
     Raises
@@ -474,24 +472,24 @@ def read_rubric(batch: Row) -> Rubric:
 NOBODY = "an erased submission"
 
 
-def erase_rows(connection: Connection, gone: Mapping[int, str]) -> None:
+def erase_rows(connection: sa.Connection, gone: Mapping[int, str]) -> None:
     """Delete all rows about the submissions in `gone`, which maps their numbers to their names.
 
     Teams that shared recordings with an erased submission keep the flag, without the erased name.
     """
     numbers = list(gone)
-    graded = select(gradings.c.id).where(gradings.c.submission_id.in_(numbers))
+    graded = sa.select(gradings.c.id).where(gradings.c.submission_id.in_(numbers))
     drop_copied(connection)
     for table in (figures, findings):
-        connection.execute(delete(table).where(table.c.grading_id.in_(graded)))
+        connection.execute(sa.delete(table).where(table.c.grading_id.in_(graded)))
     for table in (entries, events, gradings):
-        connection.execute(delete(table).where(table.c.submission_id.in_(numbers)))
-    connection.execute(delete(submissions).where(submissions.c.id.in_(numbers)))
-    flagged = select(entries.c.batch_id, entries.c.position, entries.c.shared)
+        connection.execute(sa.delete(table).where(table.c.submission_id.in_(numbers)))
+    connection.execute(sa.delete(submissions).where(submissions.c.id.in_(numbers)))
+    flagged = sa.select(entries.c.batch_id, entries.c.position, entries.c.shared)
     names = "|".join(re.escape(json.dumps(name)[1:-1]) for name in gone.values())
     any_name = re.compile(rf"(?<![\w-])(?:{names})(?![\w-])")
     for row in connection.execute(flagged.where(entries.c.shared != "")).all():
         where = (entries.c.batch_id == row.batch_id) & (entries.c.position == row.position)
         erased = any_name.sub(NOBODY, row.shared)
         if erased != row.shared:
-            connection.execute(update(entries).where(where).values(shared=erased))
+            connection.execute(sa.update(entries).where(where).values(shared=erased))

@@ -11,29 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy import (
-    DDL,
-    Boolean,
-    Column,
-    Connection,
-    Float,
-    ForeignKey,
-    Index,
-    Integer,
-    LargeBinary,
-    MetaData,
-    String,
-    Table,
-    Text,
-    TypeDecorator,
-    UniqueConstraint,
-    event,
-    func,
-    insert,
-    inspect,
-    select,
-    update,
-)
+import sqlalchemy as sa
 
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.events import TOTAL
@@ -44,20 +22,20 @@ _V1 = ("overrides", "looks", "request_events", "releases")  # tables whose rows 
 _KEPT = "v1_{}"  # name of such a table after its rows were copied
 
 
-class Words(TypeDecorator):
+class Words(sa.TypeDecorator):
     """Text that every database accepts, without NUL characters and unpaired surrogates."""
 
-    impl, cache_ok = Text, True
+    impl, cache_ok = sa.Text, True
 
     def process_bind_param(self, value: Any, dialect: object) -> Any:
         """Return the text to store."""
         return value.replace("\0", "�").encode("utf-8", "replace").decode() if value else value
 
 
-class Names(TypeDecorator):
+class Names(sa.TypeDecorator):
     """A list of texts, stored as JSON."""
 
-    impl, cache_ok = Text, True
+    impl, cache_ok = sa.Text, True
 
     def process_bind_param(self, value: Any, dialect: object) -> Any:
         """Return the JSON to store."""
@@ -68,10 +46,10 @@ class Names(TypeDecorator):
         return tuple(json.loads(value))
 
 
-class Deflated(TypeDecorator):
+class Deflated(sa.TypeDecorator):
     """Long text, stored compressed."""
 
-    impl, cache_ok = LargeBinary, True
+    impl, cache_ok = sa.LargeBinary, True
 
     def process_bind_param(self, value: Any, dialect: object) -> Any:
         """Return the compressed text to store."""
@@ -82,124 +60,124 @@ class Deflated(TypeDecorator):
         return zlib.decompress(value).decode()
 
 
-metadata = MetaData()
+metadata = sa.MetaData()
 
-settings = Table(
+settings = sa.Table(
     "settings",
     metadata,
-    Column("name", String(60), primary_key=True),
-    Column("value", Text, nullable=False),
+    sa.Column("name", sa.String(60), primary_key=True),
+    sa.Column("value", sa.Text, nullable=False),
 )
 
-submissions = Table(
+submissions = sa.Table(
     "submissions",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("assignment", String(255), nullable=False),
-    Column("name", String(510), nullable=False),  # long enough for two folder names
-    UniqueConstraint("assignment", "name"),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("assignment", sa.String(255), nullable=False),
+    sa.Column("name", sa.String(510), nullable=False),  # long enough for two folder names
+    sa.UniqueConstraint("assignment", "name"),
 )
 
 # One row for each grading of a submission; `key` is a hash of everything that affects the grade.
-gradings = Table(
+gradings = sa.Table(
     "gradings",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("submission_id", ForeignKey("submissions.id"), nullable=False),
-    Column("at", Text, nullable=False),
-    Column("key", String(255), nullable=False),
-    Column("status", Text, nullable=False),
-    Column("reason", Words, nullable=False),
-    Column("settled", Boolean, nullable=False),
-    Column("points", Float, nullable=False),
-    Column("out_of", Float, nullable=False),
-    Column("days_late", Float, nullable=False),
-    Column("deducted", Float, nullable=False),
-    Column("authors", Names, nullable=False),
-    Column("owner", Words, nullable=False),
-    Column("detail", Words, nullable=False),
-    Column("grade", Words, nullable=False),
-    Column("fingerprints", LargeBinary, nullable=False),
-    Index("gradings_by_key", "key"),
-    Index("gradings_by_submission", "submission_id"),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("submission_id", sa.ForeignKey("submissions.id"), nullable=False),
+    sa.Column("at", sa.Text, nullable=False),
+    sa.Column("key", sa.String(255), nullable=False),
+    sa.Column("status", sa.Text, nullable=False),
+    sa.Column("reason", Words, nullable=False),
+    sa.Column("settled", sa.Boolean, nullable=False),
+    sa.Column("points", sa.Float, nullable=False),
+    sa.Column("out_of", sa.Float, nullable=False),
+    sa.Column("days_late", sa.Float, nullable=False),
+    sa.Column("deducted", sa.Float, nullable=False),
+    sa.Column("authors", Names, nullable=False),
+    sa.Column("owner", Words, nullable=False),
+    sa.Column("detail", Words, nullable=False),
+    sa.Column("grade", Words, nullable=False),
+    sa.Column("fingerprints", sa.LargeBinary, nullable=False),
+    sa.Index("gradings_by_key", "key"),
+    sa.Index("gradings_by_submission", "submission_id"),
     sqlite_autoincrement=True,  # no number is given twice, even after an erasure
 )
 
-figures = Table(
+figures = sa.Table(
     "figures",
     metadata,
-    Column("grading_id", ForeignKey("gradings.id"), primary_key=True),
-    Column("position", Integer, primary_key=True),
-    Column("name", Words, nullable=False),
-    Column("svg", Deflated, nullable=False),
+    sa.Column("grading_id", sa.ForeignKey("gradings.id"), primary_key=True),
+    sa.Column("position", sa.Integer, primary_key=True),
+    sa.Column("name", Words, nullable=False),
+    sa.Column("svg", Deflated, nullable=False),
 )
 
 # Results of the checks in a grading. From them, points under a changed rubric are computed without
 # grading again.
-findings = Table(
+findings = sa.Table(
     "findings",
     metadata,
-    Column("grading_id", ForeignKey("gradings.id"), primary_key=True),
-    Column("found", Deflated, nullable=False),
+    sa.Column("grading_id", sa.ForeignKey("gradings.id"), primary_key=True),
+    sa.Column("found", Deflated, nullable=False),
 )
 
 # A complete batch and its class list. For each submission, the list has the grading that counts,
 # the flag for shared data, and the points at that time.
-batches = Table(
+batches = sa.Table(
     "batches",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("assignment", Text, nullable=False),
-    Column("at", Text, nullable=False),
-    Column("rubric", Text, nullable=False),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("assignment", sa.Text, nullable=False),
+    sa.Column("at", sa.Text, nullable=False),
+    sa.Column("rubric", sa.Text, nullable=False),
 )
 
-entries = Table(
+entries = sa.Table(
     "entries",
     metadata,
-    Column("batch_id", ForeignKey("batches.id"), primary_key=True),
-    Column("position", Integer, primary_key=True),
-    Column("submission_id", ForeignKey("submissions.id"), nullable=False),
-    Column("grading_id", ForeignKey("gradings.id"), nullable=False),
-    Column("shared", Text, nullable=False),
-    Column("points", Float, nullable=False),
-    Column("out_of", Float, nullable=False),
-    Index("entries_by_submission", "submission_id"),
+    sa.Column("batch_id", sa.ForeignKey("batches.id"), primary_key=True),
+    sa.Column("position", sa.Integer, primary_key=True),
+    sa.Column("submission_id", sa.ForeignKey("submissions.id"), nullable=False),
+    sa.Column("grading_id", sa.ForeignKey("gradings.id"), nullable=False),
+    sa.Column("shared", sa.Text, nullable=False),
+    sa.Column("points", sa.Float, nullable=False),
+    sa.Column("out_of", sa.Float, nullable=False),
+    sa.Index("entries_by_submission", "submission_id"),
 )
 
 # What people do: points, comments, reviews, requests and releases, as `events.Event` says. An event
 # without a submission is about the whole class.
-events = Table(
+events = sa.Table(
     "events",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("assignment", String(255), nullable=False),
-    Column("submission_id", ForeignKey("submissions.id")),
-    Column("grading_id", ForeignKey("gradings.id")),
-    Column("at", Text, nullable=False),
-    Column("what", String(20), nullable=False),
-    Column("criterion", Text, nullable=False),
-    Column("points", Float),
-    Column("text", Words, nullable=False),
-    Column("by", Words, nullable=False),
-    Column("authors", Names, nullable=False),
-    Index("events_by_submission", "submission_id"),
-    Index("events_by_assignment", "assignment"),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("assignment", sa.String(255), nullable=False),
+    sa.Column("submission_id", sa.ForeignKey("submissions.id")),
+    sa.Column("grading_id", sa.ForeignKey("gradings.id")),
+    sa.Column("at", sa.Text, nullable=False),
+    sa.Column("what", sa.String(20), nullable=False),
+    sa.Column("criterion", sa.Text, nullable=False),
+    sa.Column("points", sa.Float),
+    sa.Column("text", Words, nullable=False),
+    sa.Column("by", Words, nullable=False),
+    sa.Column("authors", Names, nullable=False),
+    sa.Index("events_by_submission", "submission_id"),
+    sa.Index("events_by_assignment", "assignment"),
     sqlite_autoincrement=True,  # no number is given twice, even after an erasure
 )
 
 _REFUSE = "entries of a gradebook cannot be changed"
-event.listen(
+sa.event.listen(
     metadata,
     "before_create",
-    DDL(
+    sa.DDL(
         "CREATE OR REPLACE FUNCTION cartlab_append_only() RETURNS trigger LANGUAGE plpgsql AS "
         f"$$ BEGIN RAISE EXCEPTION '{_REFUSE}'; END $$"
     ).execute_if(dialect="postgresql"),
 )
 
 
-def _locks(table: Table, dialect: str) -> list[tuple[str, str]]:
+def _locks(table: sa.Table, dialect: str) -> list[tuple[str, str]]:
     """Return the SQL that makes a table append-only, and that undoes it, for a kind of database."""
     name = table.name
     if dialect == "sqlite":
@@ -221,29 +199,29 @@ def _locks(table: Table, dialect: str) -> list[tuple[str, str]]:
 for _table in metadata.sorted_tables:
     for _dialect in ("sqlite", "postgresql"):
         for _lock, _ in _locks(_table, _dialect):
-            event.listen(_table, "after_create", DDL(_lock).execute_if(dialect=_dialect))
+            sa.event.listen(_table, "after_create", sa.DDL(_lock).execute_if(dialect=_dialect))
 
 
 @contextmanager
-def unlocked(connection: Connection) -> Iterator[None]:
+def unlocked(connection: sa.Connection) -> Iterator[None]:
     """Allow changes of rows, within this transaction."""
     locks = [
         both for one in metadata.sorted_tables for both in _locks(one, connection.dialect.name)
     ]
     for _, undo in locks:
-        connection.execute(DDL(undo))
+        connection.execute(sa.DDL(undo))
     yield
     for lock, _ in locks:
-        connection.execute(DDL(lock))
+        connection.execute(sa.DDL(lock))
 
 
-def take_turns(connection: Connection) -> None:
+def take_turns(connection: sa.Connection) -> None:
     """Wait until nobody else writes."""
     if connection.dialect.name == "postgresql":  # SQLite already holds its write lock here
-        connection.execute(select(func.pg_advisory_xact_lock(_TURN)))
+        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_TURN)))
 
 
-def is_whole(connection: Connection, *, name: str) -> bool:
+def is_whole(connection: sa.Connection, *, name: str) -> bool:
     """Return whether all tables are there, in the form of this version.
 
     Parameters
@@ -254,19 +232,19 @@ def is_whole(connection: Connection, *, name: str) -> bool:
     ------
     ConfigError : a newer cartlab wrote the gradebook.
     """
-    if not inspect(connection).has_table(settings.name):
+    if not sa.inspect(connection).has_table(settings.name):
         return False
-    found = connection.scalar(select(settings.c.value).where(settings.c.name == "schema"))
+    found = connection.scalar(sa.select(settings.c.value).where(settings.c.name == "schema"))
     if found is not None and found != _VERSION and found not in _MIGRATIONS:
         raise ConfigError(
             f"{name}: is a gradebook of version {found}, and this cartlab uses {_VERSION}: grade "
             f"into another folder, or use the cartlab that wrote it"
         )
-    there = set(inspect(connection).get_table_names())
+    there = set(sa.inspect(connection).get_table_names())
     return found == _VERSION and metadata.tables.keys() <= there
 
 
-def create_tables(connection: Connection, *, name: str) -> None:
+def create_tables(connection: sa.Connection, *, name: str) -> None:
     """Create missing tables, and copy an older gradebook into their form.
 
     Two processes may do this at the same time. A complete gradebook is left alone, because the user
@@ -276,33 +254,33 @@ def create_tables(connection: Connection, *, name: str) -> None:
     if is_whole(connection, name=name):
         return
     metadata.create_all(connection)
-    version = connection.scalar(select(settings.c.value).where(settings.c.name == "schema"))
+    version = connection.scalar(sa.select(settings.c.value).where(settings.c.name == "schema"))
     if version is None:
-        connection.execute(insert(settings).values(name="schema", value=_VERSION))
+        connection.execute(sa.insert(settings).values(name="schema", value=_VERSION))
     elif version in _MIGRATIONS:
         _MIGRATIONS[version](connection)
         with unlocked(connection):
-            connection.execute(update(settings).values(value=_VERSION))
+            connection.execute(sa.update(settings).values(value=_VERSION))
 
 
-def _copy_to_events(connection: Connection) -> None:
+def _copy_to_events(connection: sa.Connection) -> None:
     """Copy what people did from the tables of version 1, which are kept beside under other names.
 
     Version 1 had a table each for points, reviews (`looks`), requests and releases; the oldest
     gradebooks lack some. The rows of a table keep their order, even if the clocks of the computers
     that wrote them differed, because the newest row counts.
     """
-    there = set(inspect(connection).get_table_names())
+    there = set(sa.inspect(connection).get_table_names())
     names = [name for name in _V1 if name in there]
-    old = MetaData()
+    old = sa.MetaData()
     old.reflect(connection, only=names)
     number = submissions.c.id, submissions.c.assignment
-    classes = {row.id: row.assignment for row in connection.execute(select(*number))}
+    classes = {row.id: row.assignment for row in connection.execute(sa.select(*number))}
     teams = {row.id: row.submission_id for row in connection.execute(
-        select(gradings.c.id, gradings.c.submission_id))}  # fmt: skip
+        sa.select(gradings.c.id, gradings.c.submission_id))}  # fmt: skip
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     for name in names:
-        for row in connection.execute(select(old.tables[name]).order_by("id")).mappings():
+        for row in connection.execute(sa.select(old.tables[name]).order_by("id")).mappings():
             team = row.get("submission_id", teams.get(row.get("grading_id")))
             found[name].append(
                 {
@@ -319,15 +297,15 @@ def _copy_to_events(connection: Connection) -> None:
                 }
             )
     if merged := list(heapq.merge(*found.values(), key=lambda row: row["at"])):
-        connection.execute(insert(events), merged)
+        connection.execute(sa.insert(events), merged)
     for name in names:
-        connection.execute(DDL(f"ALTER TABLE {name} RENAME TO {_KEPT.format(name)}"))
+        connection.execute(sa.DDL(f"ALTER TABLE {name} RENAME TO {_KEPT.format(name)}"))
 
 
-def drop_copied(connection: Connection) -> None:
+def drop_copied(connection: sa.Connection) -> None:
     """Drop the tables of version 1 that were kept, because they name the same people."""
     for name in _V1:
-        connection.execute(DDL(f"DROP TABLE IF EXISTS {_KEPT.format(name)}"))
+        connection.execute(sa.DDL(f"DROP TABLE IF EXISTS {_KEPT.format(name)}"))
 
 
 def _old_kind(table: str, row: Any) -> str:

@@ -111,7 +111,7 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
     for _ in range(_ARCHIVES_IN_ARCHIVES):
         if _submissions(into):
             break
-        for path in _archives(into):
+        for path in [path for path in _below(into) if path.suffix.lower() == ".zip"]:
             folder = path.with_suffix("")
             if folder.exists():
                 folder = path.with_name(f"{path.stem} (unpacked)")
@@ -196,10 +196,6 @@ def _submissions(folder: Path) -> list[Path]:
     tomls = [path for path in _below(folder) if path.name == NAME]
     depth = min((len(path.parts) for path in tomls), default=0)
     return [path for path in tomls if len(path.parts) == depth]
-
-
-def _archives(folder: Path) -> list[Path]:
-    return [path for path in _below(folder) if path.suffix.lower() == ".zip"]
 
 
 def _only_submission(tomls: Sequence[Path], into: Path) -> Path:

@@ -6,7 +6,6 @@ from fractions import Fraction
 
 import numpy as np
 
-from pipeline.arrays import Array
 from pipeline.grading import limits
 from pipeline.grading import rubric as asked
 from pipeline.grading.judge.context import GradingContext, Verdict
@@ -29,26 +28,6 @@ from pipeline.grading.words import WORDS
 from pipeline.results import Stage
 from pipeline.words.text import sentence
 
-Judged = Callable[[LoopNumbers], tuple[Deviation, ...]]
-
-
-def _loop(
-    context: GradingContext, criterion: asked.Gains | asked.Claims | asked.Prefilter
-) -> tuple[Controller, Array] | Verdict:
-    """Return the controller and its gains, or a verdict that says why they cannot be judged."""
-    feedback = context.reported.feedback
-    if feedback is None or not feedback.gains:
-        why = context.because_unread("feedback", "gains")
-        return Verdict(share=NONE, message=f"No gains are reported.{why}")
-    if context.controller is None or context.controller.gains is None:
-        return Verdict(share=None, message="Not checked: the carts were not identified.")
-    controller = context.controller.judged_from(asked.source_of(criterion))
-    if not controller.models:
-        own = "your final table is not complete, so it gives no model"
-        why = own if asked.source_of(criterion) == "own" else "the carts were not identified"
-        return Verdict(share=None, message=f"Not checked: {why}.")
-    return controller, context.controller.gains
-
 
 @dataclass(frozen=True, kw_only=True)
 class _Best:
@@ -64,17 +43,38 @@ class _Best:
     models: tuple[tuple[Deviation, ...], ...]
 
 
+def _controller(
+    criterion: asked.Gains | asked.Claims | asked.Prefilter, context: GradingContext
+) -> Controller | Verdict:
+    """Return the controller with the models that count, or a verdict without them."""
+    feedback = context.reported.feedback
+    if feedback is None or not feedback.gains:
+        why = context.because_unread("feedback", "gains")
+        return Verdict(share=NONE, message=f"No gains are reported.{why}")
+    if context.controller is None or context.controller.gains is None:
+        return Verdict(share=None, message="Not checked: the carts were not identified.")
+    source = asked.source_of(criterion)
+    controller = context.controller.judged_from(source)
+    if not controller.models:
+        own = "your final table is not complete, so it gives no model"
+        why = own if source == "own" else "the carts were not identified"
+        return Verdict(share=None, message=f"Not checked: {why}.")
+    return controller
+
+
 def _best(
-    criterion: asked.Criterion, controller: Controller, gains: Array, judged: Judged
-) -> _Best | None:
-    every = controller.numbers(gains)
-    models = tuple(map(judged, every))
-    found = [
-        (points_for(criterion, one), numbers) for one, numbers in zip(models, every, strict=True)
-    ]
-    if not found:
-        return None
-    share, numbers = max(found, key=lambda one: one[0])
+    criterion: asked.Criterion,
+    controller: Controller,
+    errors: Callable[[LoopNumbers], tuple[Deviation, ...]],
+) -> _Best | Verdict:
+    """Simulate the gains on each model; without a result, a verdict says why."""
+    assert controller.gains is not None
+    every = controller.numbers(controller.gains)
+    if not every:
+        return Verdict(share=NONE, message="These gains cannot be simulated.")
+    models = tuple(map(errors, every))
+    shares = [points_for(criterion, model) for model in models]
+    share, numbers = max(zip(shares, every, strict=True), key=lambda one: one[0])
     return _Best(share=share, numbers=numbers, models=models)
 
 
@@ -83,27 +83,27 @@ def judge_gains(criterion: asked.Gains, context: GradingContext) -> Verdict:
 
     If several models are acceptable, the one with the best result counts.
     """
-    loop = _loop(context, criterion)
-    if isinstance(loop, Verdict):
-        return loop
-    controller, gains = loop
+    controller = _controller(criterion, context)
+    if isinstance(controller, Verdict):
+        return controller
     goal = controller.goal
 
-    def judged(numbers: LoopNumbers) -> tuple[Deviation, ...]:
+    def errors(numbers: LoopNumbers) -> tuple[Deviation, ...]:
         if not numbers.stable or numbers.settling_time is None:
             return (Deviation(error=NO_CREDIT, by="settling"),)
         over = Fraction(max(numbers.overshoot - goal.overshoot_percent, 0.0))
         late = Fraction(100 * max(numbers.settling_time / goal.settling_time - 1, 0.0))
         return Deviation(error=over, by="overshoot"), Deviation(error=late, by="settling")
 
-    best = _best(criterion, controller, gains, judged)
-    if best is None:
-        return Verdict(share=NONE, message="These gains cannot be simulated.")
+    best = _best(criterion, controller, errors)
+    if isinstance(best, Verdict):
+        return best
     numbers, most, only_on_paper, ordered = best.numbers, ALL, "", ""
     if context.gains_order:
         said = WORDS.text("other_order_of_gains", order=order_names(context.gains_order))
         ordered = f" {said}"
-    if runaway := controller.runaway(gains):
+    assert controller.gains is not None
+    if runaway := controller.runaway(controller.gains):
         if numbers.stable:
             only_on_paper = f" {WORDS.text('only_on_paper', does=does(numbers))}"
         most, numbers = limits.KEPT_IF_HARMFUL, runaway
@@ -133,13 +133,12 @@ def _claimable(numbers: LoopNumbers) -> dict[str, float | None]:
 
 def judge_claims(criterion: asked.Claims, context: GradingContext) -> Verdict:
     """Judge the reported overshoot and settling time by a simulation with the reported gains."""
-    loop = _loop(context, criterion)
-    if isinstance(loop, Verdict):
-        return loop
-    controller, gains = loop
+    controller = _controller(criterion, context)
+    if isinstance(controller, Verdict):
+        return controller
     claims = {"overshoot_percent": controller.overshoot, "settling_time": controller.settling}
 
-    def judged(numbers: LoopNumbers) -> tuple[Deviation, ...]:
+    def errors(numbers: LoopNumbers) -> tuple[Deviation, ...]:
         over = late = NO_CREDIT
         if controller.overshoot is not None and np.isfinite(numbers.overshoot):
             off = abs(Fraction(controller.overshoot) - Fraction(numbers.overshoot))
@@ -149,9 +148,9 @@ def judge_claims(criterion: asked.Claims, context: GradingContext) -> Verdict:
             late = percent_off(controller.settling, right, sigmas=0.0)
         return Deviation(error=over, by="overshoot"), Deviation(error=late, by="settling")
 
-    best = _best(criterion, controller, gains, judged)
-    if best is None:
-        return Verdict(share=NONE, message="These gains cannot be simulated.")
+    best = _best(criterion, controller, errors)
+    if isinstance(best, Verdict):
+        return best
     share, expected = best.share, _claimable(best.numbers)
     unread = "".join(context.because_unread("feedback", name) for name in claims)
     return Verdict(
@@ -164,7 +163,7 @@ def judge_claims(criterion: asked.Claims, context: GradingContext) -> Verdict:
         found={name: float(v) for name, v in claims.items() if v is not None},
         agrees={
             name: points_for_one(criterion, off) == 1
-            for (name, claim), off in zip(claims.items(), judged(best.numbers), strict=True)
+            for (name, claim), off in zip(claims.items(), errors(best.numbers), strict=True)
             if claim is not None
         },
     )
@@ -172,23 +171,22 @@ def judge_claims(criterion: asked.Claims, context: GradingContext) -> Verdict:
 
 def judge_prefilter(criterion: asked.Prefilter, context: GradingContext) -> Verdict:
     """Judge the prefilter against the reciprocal of the loop's static gain."""
-    loop = _loop(context, criterion)
-    if isinstance(loop, Verdict):
-        return loop
-    controller, gains = loop
+    controller = _controller(criterion, context)
+    if isinstance(controller, Verdict):
+        return controller
     typed = controller.prefilter
     if typed is None:
         why = context.because_unread("feedback", "prefilter")
         return Verdict(share=NONE, message=f"No prefilter is reported.{why}")
 
-    def judged(numbers: LoopNumbers) -> tuple[Deviation, ...]:
+    def errors(numbers: LoopNumbers) -> tuple[Deviation, ...]:
         signed = typed if numbers.prefilter > 0 else -typed
         right = Reference.at(abs(numbers.prefilter))
         return (Deviation(error=percent_off(signed, right, sigmas=0.0)),)
 
-    best = _best(criterion, controller, gains, judged)
-    if best is None:
-        return Verdict(share=NONE, message="These gains cannot be simulated.")
+    best = _best(criterion, controller, errors)
+    if isinstance(best, Verdict):
+        return best
     share, right = best.share, best.numbers.prefilter
     return Verdict(
         share=share,

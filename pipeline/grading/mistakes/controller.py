@@ -304,20 +304,16 @@ def reported_controller(
         own=any(model is not None for model in own),
         reference=chain,
     )
-    order = None
+
+    def judged(one: Controller) -> Controller:
+        doubt = _doubt(one, submission, analysis)
+        return replace(one, doubt=doubt, goal=_goal(one, submission, analysis))
+
     for one in orders:
-        meant = _in_order(controller, one)
-        better = replace(
-            meant,
-            doubt=_doubt(meant, submission, analysis),
-            goal=_goal(meant, submission, analysis),
-        )
+        better = judged(_in_order(controller, one))
         if better.confirms(better.gains) and not better.confirms(controller.gains):
-            controller, order = better, one
-            break
-    doubt = _doubt(controller, submission, analysis)
-    goal = _goal(controller, submission, analysis)
-    return replace(controller, doubt=doubt, goal=goal), order
+            return judged(better), one
+    return judged(controller), None
 
 
 def _in_order(controller: Controller, order: Order) -> Controller:
@@ -328,13 +324,6 @@ def _in_order(controller: Controller, order: Order) -> Controller:
     meant = np.empty_like(gains)
     meant[list(order)] = gains
     return replace(controller, gains=meant)
-
-
-def _goal(controller: Controller, submission: Submission, analysis: Analysis) -> Design:
-    """Return the design goal, or an easier one if neither gains nor reference design reach it."""
-    if controller.gains is None or controller.reaches_goal(controller.gains):
-        return controller.goal
-    return _reachable(controller.goal, submission, analysis)
 
 
 def _doubt(controller: Controller, submission: Submission, analysis: Analysis) -> float:
@@ -373,11 +362,14 @@ def _by_rounding(typed: Mapping[str, Decimal], gains: Array, *, cart: int) -> fl
     return limits.PREFILTER_SIGMAS / np.sqrt(3) * float(np.linalg.norm(relative))
 
 
-def _reachable(goal: Design, submission: Submission, analysis: Analysis) -> Design:
-    """Return the goal, or an easier one if the reference design misses it.
+def _goal(controller: Controller, submission: Submission, analysis: Analysis) -> Design:
+    """Return the goal, or an easier one if neither the gains nor the reference design reach it.
 
     The easier goal is what the reference design reaches.
     """
+    goal = controller.goal
+    if controller.gains is None or controller.reaches_goal(controller.gains):
+        return goal
     try:
         design = reference_design(submission, analysis.fit)
     except DataError:

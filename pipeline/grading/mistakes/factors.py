@@ -30,7 +30,7 @@ Of = Literal[
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Factor:
     """A row of the table: a mistake that multiplies the right number by a factor.
 
@@ -38,95 +38,48 @@ class Factor:
     ----------
     advice_key : key of the advice in `templates/words/grading.toml`.
     of : the group of numbers that the mistake can affect.
-    whole, least, tries, from_time_records : see `Mistake`.
+    tolerance, whole, least, tries, from_time_records : see `Mistake`.
     """
 
     code: Code
     advice_key: str
     of: Of
     factor: float
-    tolerance: float
+    tolerance: float = MISREAD_RATIO
     whole: bool = False
     least: int = 1
     tries: int = 1
     from_time_records: bool = False
 
 
-def _frequency(advice_key: str, factor: float, *, of: Of = "frequencies", least: int = 1) -> Factor:
-    tolerance = limits.UNMISTAKABLE
-    return Factor(
-        code="hz_for_rad_s",
-        advice_key=advice_key,
-        of=of,
-        factor=factor,
-        tolerance=tolerance,
-        least=least,
-    )
-
-
-def _peaks(advice_key: str, factor: float, *, of: Of, whole: bool = False) -> Factor:
-    return Factor(
-        code="peak_to_peak",
-        advice_key=advice_key,
-        of=of,
-        factor=factor,
-        tolerance=limits.READ,
-        whole=whole,
-    )
-
-
-def _log10(of: Of) -> Factor:
-    return Factor(
-        code="log10_for_ln",
-        advice_key="log10",
-        of=of,
-        factor=LOG10,
-        tolerance=limits.LOG10_DAMPING,
-        whole=True,
-        from_time_records=True,
-    )
-
-
-def _decrement(advice_key: str, factor: float) -> Factor:
-    return Factor(
-        code="peak_count",
-        advice_key=advice_key,
-        of="sharp dampings",
-        factor=factor,
-        tolerance=limits.READ,
-        tries=2,
-        from_time_records=True,
-    )
-
-
-def _reduced(code: Code, advice_key: str, factor: float, *, of: Of) -> Factor:
-    return Factor(code=code, advice_key=advice_key, of=of, factor=factor, tolerance=MISREAD_RATIO)
-
+_CLEAR, _READ = limits.UNMISTAKABLE, limits.READ
+_LOG10 = {"tolerance": limits.LOG10_DAMPING, "whole": True, "from_time_records": True}
+_DECREMENT = {"tolerance": _READ, "tries": 2, "from_time_records": True}
 
 FACTORS = (
-    _frequency("hertz", 1 / TURN),
+    Factor("hz_for_rad_s", "hertz", "frequencies", 1 / TURN, _CLEAR),
     # With wide bounds, one frequency proves nothing, so a second number must match.
-    _frequency("hertz", 1 / TURN, of="all frequencies", least=2),
-    _frequency("hertz_twice", TURN),
+    Factor("hz_for_rad_s", "hertz", "all frequencies", 1 / TURN, _CLEAR, least=2),
+    Factor("hz_for_rad_s", "hertz_twice", "frequencies", TURN, _CLEAR),
     # A team that reads peak to peak does so for every cart. For one cart alone, only a precise
     # reference proves it.
-    _peaks("peak_to_peak", 2.0, of="gains", whole=True),
-    _peaks("input_peak_to_peak", 0.5, of="gains", whole=True),
-    _peaks("peak_to_peak", 2.0, of="sharp gains"),
-    _peaks("input_peak_to_peak", 0.5, of="sharp gains"),
-    _log10("dampings"),
-    _log10("every damping"),
+    Factor("peak_to_peak", "peak_to_peak", "gains", 2.0, _READ, whole=True),
+    Factor("peak_to_peak", "input_peak_to_peak", "gains", 0.5, _READ, whole=True),
+    Factor("peak_to_peak", "peak_to_peak", "sharp gains", 2.0, _READ),
+    Factor("peak_to_peak", "input_peak_to_peak", "sharp gains", 0.5, _READ),
+    Factor("log10_for_ln", "log10", "dampings", LOG10, **_LOG10),
+    Factor("log10_for_ln", "log10", "every damping", LOG10, **_LOG10),
     # The decrement was taken over half a period, or over two. The frequency of the decay must be
     # right, and there must be no friction.
-    _decrement("half_decrement", 0.5),
-    _decrement("twice_decrement", 2.0),
+    Factor("peak_count", "half_decrement", "sharp dampings", 0.5, **_DECREMENT),
+    Factor("peak_count", "twice_decrement", "sharp dampings", 2.0, **_DECREMENT),
     # A column with the heading Hz contains rad/s, or vice versa.
-    _reduced("hz_for_rad_s", "reduced_radians", 1 / TURN, of="frequencies of rows"),
-    _reduced("hz_for_rad_s", "reduced_hertz", TURN, of="frequencies of rows"),
-    _reduced("peak_to_peak", "reduced_twice", 2.0, of="ratios of rows"),
-    _reduced("peak_to_peak", "reduced_half", 0.5, of="ratios of rows"),
-    _reduced("peak_to_peak", "gains_twice", 2.0, of="fitted gains"),
-    _reduced("peak_to_peak", "gains_half", 0.5, of="fitted gains"),
-    _reduced("hz_for_rad_s", "frequencies_in_radians", TURN, of="fitted frequencies"),
-    _reduced("hz_for_rad_s", "frequencies_in_hertz", 1 / TURN, of="fitted frequencies"),
+    Factor("hz_for_rad_s", "reduced_radians", "frequencies of rows", 1 / TURN),
+    Factor("hz_for_rad_s", "reduced_hertz", "frequencies of rows", TURN),
+    Factor("peak_to_peak", "reduced_twice", "ratios of rows", 2.0),
+    Factor("peak_to_peak", "reduced_half", "ratios of rows", 0.5),
+    Factor("peak_to_peak", "gains_twice", "fitted gains", 2.0),
+    Factor("peak_to_peak", "gains_half", "fitted gains", 0.5),
+    Factor("hz_for_rad_s", "frequencies_in_radians", "fitted frequencies", TURN),
+    Factor("hz_for_rad_s", "frequencies_in_hertz", "fitted frequencies", 1 / TURN),
 )

@@ -124,7 +124,7 @@ def put_in_order(space: ReportedStateSpace, order: Order) -> ReportedStateSpace:
 
 
 def compare_entries(
-    space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int, order: Order = ()
+    space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int, order: Order
 ) -> list[MatrixEntry]:
     """Compare every reported entry with the acceptable [A B].
 
@@ -133,9 +133,9 @@ def compare_entries(
 
     Parameters
     ----------
-    order : the order of the states, from `find_order`; by default x1, v1, x2, v2, …
+    order : the order of the states, from `find_order`.
     """
-    places = (*(order or range(2 * n)), 2 * n)
+    places = (*order, 2 * n)
     kinds, entries = _kinds(n), []
     for typed_at, number in _matrix(space, n).items():
         i, j = places[typed_at[0]], places[typed_at[1]]
@@ -229,10 +229,7 @@ def _own_names(i: int, n: int) -> tuple[str, str]:
 
 
 def _implied(values: Mapping[str, float], n: int) -> Array | None:
-    """Return the [A B] of the chain that a table's transfer functions imply.
-
-    Returns None if there is no such chain.
-    """
+    """Return the [A B] of the chain that a table implies; None if there is no such chain."""
     chain = own_chain(values, n=n)
     return None if chain is None else _matrices(chain)
 
@@ -336,13 +333,11 @@ def derived_numbers(values: Mapping[str, Number], *, n: int) -> dict[str, Refere
         moved = shifted.parameters() if shifted else right
         for one in names:
             slack[one] += abs(moved[one] - right[one])
+    bounds = {name: (right[name] - slack[name], right[name] + slack[name]) for name in names}
     return {
-        name: Reference(
-            value=right[name], low=right[name] - slack[name], high=right[name] + slack[name],
-            std=0.0, source=OWN,
-        )
-        for name in names
-    }  # fmt: skip
+        name: Reference(value=right[name], low=low, high=high, source=OWN)
+        for name, (low, high) in bounds.items()
+    }
 
 
 def _kinds(n: int) -> list[list[EntryKind]]:
@@ -371,9 +366,7 @@ def _entry_error(typed: Decimal, right: float, kind: EntryKind, *, slack: float 
     if right == 0:
         return Fraction(0) if abs(typed) <= limits.EXACT else Fraction(10**6)
     size = abs(right)
-    reference = Reference(
-        value=size, low=max(size - slack, 0.0), high=size + slack, std=0.0, source=""
-    )
+    reference = Reference(value=size, low=max(size - slack, 0.0), high=size + slack)
     return percent_off(typed if right > 0 else -typed, reference, sigmas=0.0)
 
 
@@ -389,7 +382,7 @@ def model_harm(
     models: Sequence[StateMatrices],
     n: int,
     tied: bool,
-    order: Order = (),
+    order: Order,
 ) -> Harm | None:
     """Return how wrong entries make the model behave as no real bench can; None if they do not.
 
@@ -401,7 +394,6 @@ def model_harm(
     ----------
     tied : whether a spring ties the carts to a wall, so that they settle under a constant input.
     """
-    order = order or tuple(range(2 * n))
     wrong = {entry.at: entry.typed for entry in entries if entry.wrong}
     whole = [one.right for one in models if np.all(np.isfinite(one.right))]
     if not wrong or not whole or not (space.A and space.B):
@@ -449,7 +441,7 @@ def diagnose_state_space(
     *,
     models: Sequence[StateMatrices],
     n: int,
-    order: Order = (),
+    order: Order,
 ) -> list[Flag]:
     """Return a flag if entries are wrong, with the known mistake that explains all of them, if any.
 
@@ -485,7 +477,7 @@ def _slip(
 ) -> str:
     """Return, in words, the first mistake that leads to the reported [A B]; "" if none does."""
     as_typed, kinds = _matrix(space, n), _kinds(n)
-    typed = _matrix(put_in_order(space, order), n) if order else as_typed
+    typed = _matrix(put_in_order(space, order), n)
     # A student may have changed the order of the states in A but not in B.
     mixed = {at: (typed if at[1] < 2 * n else as_typed)[at] for at in typed}
     for model in (one.right for one in models if np.all(np.isfinite(one.right))):

@@ -408,9 +408,7 @@ def _disagreements(
             if blurred:
                 spread = references.initial[name].high / references.initial[name].low
                 bounds += [bounds[0] / spread, bounds[0] * spread]
-        allowed = Reference(
-            value=float(final), low=min(bounds), high=max(bounds), std=0.0, source="final"
-        )
+        allowed = Reference(value=float(final), low=min(bounds), high=max(bounds), source="final")
         error = float(percent_off(initial, allowed, sigmas=0.0))
         worth = 2 * limits.OFF_DAMPING if read_name(name).is_damping else limits.OFF_EACH_OTHER
         by_eye = limit(name, "initial") == limits.OFF_BY_EYE

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _OUTCOMES = ("pass", "partial", "fail", "skip")
+_HELD = "Held back, so without points here"
 _NAMED = 8  # largest number of submissions or recordings in one row
 
 
@@ -68,7 +69,7 @@ def class_page(
                 *_board(grades, points, rubric),
                 *_points(page, points, rubric),
                 *_to_look_at(grades, repeated_authors, distant),
-                *_held_back(held),
+                *([paragraph(f"{_HELD}: {listing(sorted(held))}.")] if held else []),
             ],
         ),
         ("mistakes", "Most common mistakes", lambda page: _mistakes(page, grades)),
@@ -134,12 +135,6 @@ def _to_look_at(
         others = bullet_list(spans(_link(one.submission), f": {one}.") for one in distant)
         blocks += [paragraph(WORDS.text("distant")), others]
     return blocks
-
-
-def _held_back(held: Collection[str]) -> list[Block]:
-    if not held:
-        return []
-    return [paragraph(f"Held back, so without points here: {listing(sorted(held))}.")]
 
 
 def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:

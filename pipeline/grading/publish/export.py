@@ -30,6 +30,8 @@ from pipeline.output import csv_text, named_folder, own_folder, write_file, zip_
 from pipeline.words.text import with_symbols
 
 _NAMED = 8  # most submissions that a remark names
+_ZIP = "feedback-{}.zip"
+_HELD = "held back, so not exported"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +78,7 @@ def export(
         left += f" in {platform.name}.csv, but 0 in results.json, where a score is required"
     ungraded = (s.grade.submission for s in students if not (s.points or s.undecided))
     remarks += about(f"could not be graded, {left}", ungraded)
-    remarks += [*_not_final(entries), *_say_held(held)]
+    remarks += [*_not_final(entries), *about(_HELD, held)]
     if not platform.takes_more:
         above = [e for e in entries if e.grade.points > rubric.out_of]
         remarks += about(
@@ -120,10 +122,6 @@ def _without_held(book: Gradebook) -> tuple[list[Entry], list[str]]:
     return [entry for entry in every if not entry.hold], held
 
 
-def _say_held(held: Sequence[str]) -> list[Remark]:
-    return about("held back, so not exported", held)
-
-
 def _not_final(entries: Sequence[Entry]) -> list[Remark]:
     """Return a remark that names the submissions that a person has yet to grade."""
     unfinished = [entry.submission for entry in entries if entry.grade.open]
@@ -160,10 +158,8 @@ def _make_table(
     numbered = bool(students) and all(student.number for student in students)
     form = platform.form(numbered=numbered)
     head = [name.format(title=title) for name in form.new]
-    rows = []
-    for student in students:
-        values = values_of(student, rubric)
-        rows.append([text.format_map(values) for text in form.new.values()])
+    values = [values_of(student, rubric) for student in students]
+    rows = [[text.format_map(own) for text in form.new.values()] for own in values]
     if platform.maxima:
         possible = [f"    {platform.maxima}", *[""] * (len(head) - 2), points_text(rubric.out_of)]
         rows.insert(0, possible)
@@ -179,6 +175,7 @@ def _make_table(
 def values_of(student: Student, rubric: Rubric) -> dict[str, str]:
     """Return the values of a student by the names that `platforms.Table` uses for them."""
     first, _, last = student.name.partition(" ")
+    comment = () if student.undecided else _comment_lines(student.view)
     return {
         "name": student.name,
         "id": student.id,
@@ -193,15 +190,8 @@ def values_of(student: Student, rubric: Rubric) -> dict[str, str]:
         "most": points_text(rubric.out_of),
         "status": "Graded" if student.points else "Ungraded",
         "late": _clock(student.grade.days_late),
-        "comment": _comment(student),
+        "comment": "<br>".join(html.escape(line, quote=False) for line in comment),  # for Moodle
     }
-
-
-def _comment(student: Student) -> str:
-    """Return short feedback as HTML, which Moodle expects."""
-    if student.undecided:
-        return ""
-    return "<br>".join(html.escape(line, quote=False) for line in _comment_lines(student.view))
 
 
 def _comment_lines(view: GradeView) -> list[str]:
@@ -265,13 +255,15 @@ def export_feedback(
         takers = " or ".join(one.name for one in PLATFORMS.values() if one.feedback)
         raise ConfigError(f"{platform.title} takes no zip of feedback files: give --lms {takers}")
     named = out.suffix.lower() == ".zip" and not out.is_dir()
-    file = out if named else named_folder(out) / _zip_name(platform)
+    file = out if named else named_folder(out) / _ZIP.format(platform.name)
     exported, held = _without_held(book)
     entries = {entry.submission: entry for entry in exported}
     waiting = [name for name, entry in entries.items() if entry.grade.awaits_grading]
     ready = [entry for name, entry in entries.items() if name not in waiting]
     students, remarks = students_of(ready, platform=platform, accounts=True)
-    remarks += _not_final(ready) + about("not graded yet, so left out", waiting) + _say_held(held)
+    remarks += (
+        _not_final(ready) + about("not graded yet, so left out", waiting) + about(_HELD, held)
+    )
     if roster:
         students = Roster.read(roster, platform=platform).identify(students)
     placed, problems = _place(students, platform, has_roster=roster is not None)
@@ -306,8 +298,9 @@ def _place(
     whose: dict[str, str] = {}
     lost, twice, guessed = [], [], []
     for student in students:
-        path, submission = _path_of(student, platform), student.grade.submission
-        if not path:
+        place = {x: getattr(student, x) for x in ("name", "number", "download")}
+        path, submission = platform.feedback_path(**place), student.grade.submission
+        if student.undecided or not path:
             lost += [] if student.undecided or student.uploader else [student]
         elif whose.setdefault(path.casefold(), submission) != submission:
             twice.append(student)
@@ -329,23 +322,10 @@ def _place(
     return placed, remarks + not_exported("another file has the same name", twice)
 
 
-def _path_of(student: Student, platform: Platform) -> str:
-    """Return the path of a student's feedback in the zip; "" if it is not known."""
-    if student.undecided:
-        return ""
-    return platform.feedback_path(
-        name=student.name, number=student.number, download=student.download
-    )
-
-
-def _zip_name(platform: Platform) -> str:
-    return f"feedback-{platform.name}.zip"
-
-
 def remove_exports(folder: Path) -> list[Path]:
     """Remove the files that earlier exports wrote into a class's folder; return their paths."""
     tables = [folder / f"{name}.csv" for name in PLATFORMS]
-    pages = [folder / _zip_name(platform) for platform in PLATFORMS.values()]
+    pages = [folder / _ZIP.format(name) for name in PLATFORMS]
     results = [
         file
         for platform in PLATFORMS.values()

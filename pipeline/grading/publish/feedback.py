@@ -81,7 +81,8 @@ def _summary(view: GradeView) -> list[Block]:
     grade, overrides = view.grade, view.grade.overrides
     points = f"{points_text(grade.points)} of {points_text(grade.out_of)}"
     points += " so far" if view.held else ""
-    by_hand = Tile(spans("Set by hand"), spans(counted_criteria(len(overrides))))
+    criteria = f"{len(overrides)} {'criterion' if len(overrides) == 1 else 'criteria'}"
+    by_hand = Tile(spans("Set by hand"), spans(criteria))
     if grade.status == "failed":
         key = "failed_by_hand" if overrides else "unsettled" if grade.unsettled else "failed"
         shown = WORDS.text("unsettled_points") if grade.awaits_grading else points
@@ -111,7 +112,8 @@ def _summary(view: GradeView) -> list[Block]:
         ),
     ]
     if grade.days_late > 0:
-        late = f"{counted_days(grade.days_late)}, −{points_text(grade.deducted)} points"
+        days = f"{grade.days_late:.3g} day{'' if grade.days_late == 1 else 's'}"
+        late = f"{days}, −{points_text(grade.deducted)} points"
         tiles.append(Tile(spans("Late"), spans(late), tone="bad" if grade.deducted else ""))
     if overrides:
         tiles.append(by_hand)
@@ -122,16 +124,6 @@ def _summary(view: GradeView) -> list[Block]:
 def _by_person(view: GradeView) -> list[Block]:
     """Return the changes of the total with their reasons, and what is not in it yet."""
     return [paragraph(rich(sentence(line))) for line in view.person_lines()]
-
-
-def counted_days(days: float) -> str:
-    """Return a number of days in words: "1 day", "1.5 days"."""
-    return f"{days:.3g} day{'' if days == 1 else 's'}"
-
-
-def counted_criteria(n: int) -> str:
-    """Return a number of criteria in words: "1 criterion", "2 criteria"."""
-    return f"{n} {'criterion' if n == 1 else 'criteria'}"
 
 
 def _lost(view: GradeView) -> list[Block]:

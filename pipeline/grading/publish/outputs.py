@@ -64,9 +64,9 @@ def write_outputs(
     shared: dict[str, Flag] = {}
     numbers: dict[str, dict[Quantity, float]] = {}
     for entry in book.shown_entries():
-        shared |= dict(
-            (entry.submission, flag) for flag in entry.grade.flags if flag.code == "shared_data"
-        )
+        for flag in entry.grade.flags:
+            if flag.code == "shared_data":
+                shared[entry.submission] = flag
         seen = view(entry, "staff", names=names)
         grade = seen.grade
         grades.append(grade)
@@ -84,11 +84,7 @@ def write_outputs(
         progress(f"feedback: {grade.submission}")
         (folder / _MADE).unlink(missing_ok=True)  # if this run stops, the next one writes all pages
         own.mkdir(exist_ok=True)
-        page = feedback_page(
-            seen,
-            figures=book.figures(entry),
-            name=grade.submission,
-        )
+        page = feedback_page(seen, figures=book.figures(entry), name=grade.submission)
         write_file(own / _PAGE, page)
         write_file(own / _JSON, grade_text(grade))
     if names is not None:
@@ -159,42 +155,36 @@ def grades_csv(grades: Sequence[Grade], *, rubric: Rubric, held: Collection[str]
     held : submissions whose grades are held back; their rows have no points.
     """
     taken = {*_BEFORE, *_AFTER}
-    ids = [criterion.id for criterion in rubric.criteria]
-    heads = [f"criterion {id_}" if id_ in taken else id_ for id_ in ids]
-    rows = [
-        (
-            grade.submission,
-            " ".join(grade.authors),
-            "held",
-            "",
-            grade.out_of,
-            grade.days_late,
-            *[""] * (len(ids) + 1),
-            " ".join(grade.codes),
-            "",
-            "",
-            "",
-            "",
-        )
-        if grade.submission in held
-        else (
-            grade.submission,
-            " ".join(grade.authors),
-            grade.status,
-            grade.points,
-            grade.out_of,
-            grade.days_late,
-            grade.deducted,
-            *(grade.judged[id_].points if id_ in grade.judged else "" for id_ in ids),
-            " ".join(grade.codes),
-            " ".join(grade.by_hand),
-            on_one_line(grade.reason),
-            sum(one.points for one in grade.adjustments),
-            " ".join(grade.open),
-        )
-        for grade in grades
+    heads = [
+        f"criterion {asked.id}" if asked.id in taken else asked.id for asked in rubric.criteria
     ]
-    return csv_text((*_BEFORE, *heads, *_AFTER), rows)
+
+    def cells(grade: Grade) -> dict[str, object]:
+        own: dict[str, object] = {
+            "submission": grade.submission,
+            "authors": " ".join(grade.authors),
+            "out_of": grade.out_of,
+            "days_late": grade.days_late,
+            "remarks": " ".join(grade.codes),
+        }
+        if grade.submission in held:
+            return {**own, "status": "held"}
+        points = (grade.judged.get(asked.id) for asked in rubric.criteria)
+        given = {head: one.points for head, one in zip(heads, points, strict=True) if one}
+        return {
+            **own,
+            **given,
+            "status": grade.status,
+            "points": grade.points,
+            "deducted": grade.deducted,
+            "by_hand": " ".join(grade.by_hand),
+            "reason": on_one_line(grade.reason),
+            "adjusted": sum(one.points for one in grade.adjustments),
+            "open": " ".join(grade.open),
+        }
+
+    columns = (*_BEFORE, *heads, *_AFTER)
+    return csv_text(columns, [[own.get(x, "") for x in columns] for own in map(cells, grades)])
 
 
 def _names(book: Gradebook, out: Path) -> dict[str, str]:

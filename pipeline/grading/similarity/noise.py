@@ -64,8 +64,8 @@ def compare(a: Fingerprint, b: Fingerprint, *, shift: int) -> Match:
     ----------
     shift : shift between the recordings: sample i of `a` corresponds to sample i + shift of `b`.
     """
-    first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
-    found = _between(a, b, shift=shift, first=first, last=last)
+    first, last = _overlap(a, b, shift)
+    found = _match(a, b, shift, first, last)
     if last - first < LEAST_OVERLAP:
         return found
     # All carts are scaled to units of b's noise, so that each of them counts.
@@ -91,7 +91,12 @@ def compare(a: Fingerprint, b: Fingerprint, *, shift: int) -> Match:
     return replace(found, slope=product / min(of_a, of_b), sigmas=product / chance)
 
 
-def _between(a: Fingerprint, b: Fingerprint, *, shift: int, first: int, last: int) -> Match:
+def _overlap(a: Fingerprint, b: Fingerprint, shift: int) -> tuple[int, int]:
+    """Return the first sample of `a` that `b` contains too, and the one after the last."""
+    return max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
+
+
+def _match(a: Fingerprint, b: Fingerprint, shift: int, first: int, last: int) -> Match:
     """Return a result for a part of `a`, with experiments and times but without similarity."""
     return Match(
         experiments=(a.experiment, b.experiment),
@@ -105,7 +110,7 @@ def equal_rows(a: Fingerprint, b: Fingerprint, *, shift: int) -> Match | None:
     Repeated readings, as from a cart at rest, count once. Returns None if too few remain to be
     significant.
     """
-    first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
+    first, last = _overlap(a, b, shift)
     if last - first < LEAST_OVERLAP:
         return None
     in_a = a.measured[:, first:last].astype(np.float64)
@@ -125,11 +130,8 @@ def equal_rows(a: Fingerprint, b: Fingerprint, *, shift: int) -> Match | None:
     shorter = min(a.residual.shape[1], b.residual.shape[1])
     if different < LEAST_OVERLAP or stop - start < _EQUAL_PART * shorter:
         return None
-    return replace(
-        _between(a, b, shift=shift, first=first + start, last=first + stop),
-        equal_rows=stop - start,
-        different=different,
-    )
+    match = _match(a, b, shift, first + start, first + stop)
+    return replace(match, equal_rows=stop - start, different=different)
 
 
 _BANDS = ((0.2, 0.3), (0.3, 0.4), (0.4, 0.5))  # cycles per sample, above the fingerprint's corner
@@ -216,14 +218,9 @@ class Agreement:
     def match_of(self, sigmas: float) -> Match:
         """Return the agreement as a similarity of two recordings."""
         a, b = self.fingerprints
-        first = max(0, -self.shift)
-        last = min(a.residual.shape[1], b.residual.shape[1] - self.shift)
-        return Match(
-            experiments=(a.experiment, b.experiment),
-            times=(a.times(first, last), b.times(first + self.shift, last + self.shift)),
-            sigmas=sigmas,
-            delay=None if self.delay is None else self.delay.samples,
-        )
+        match = _match(a, b, self.shift, *_overlap(a, b, self.shift))
+        delay = None if self.delay is None else self.delay.samples
+        return replace(match, sigmas=sigmas, delay=delay)
 
     @property
     def match_strength(self) -> float:
