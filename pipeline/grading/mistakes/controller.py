@@ -164,7 +164,7 @@ class Controller:
 
     def numbers(self, gains: Array) -> list[LoopNumbers]:
         """Return the simulated loop with some gains, one for each model."""
-        found = [self._on(chain, gains) for chain in self.models]
+        found = [self.on(chain, gains) for chain in self.models]
         return [numbers for numbers in found if numbers is not None]
 
     def runaway(self, gains: Array) -> LoopNumbers | None:
@@ -172,17 +172,18 @@ class Controller:
 
         Growth by less than a factor of e within the required settling time may be a model error.
         """
-        numbers = self._on(self.reference, gains) if self.reference is not None else None
+        numbers = self.on(self.reference, gains) if self.reference is not None else None
         if numbers is None or numbers.stable:
             return None
         fast = float(numbers.poles.real.max()) * self.goal.settling_time > 1
         return numbers if fast else None
 
-    def _on(self, chain: Chain, gains: Array) -> LoopNumbers | None:
+    def on(self, chain: Chain, gains: Array, *, cart: int = 0) -> LoopNumbers | None:
+        """Return the loop with some gains on a chain, for one cart; default: that of the goal."""
         return loop_numbers(
             chain,
             gains,
-            cart=self.goal.cart,
+            cart=cart or self.goal.cart,
             settling=self.goal.settling_time,
             sample_time=self.goal.sample_time,
         )
@@ -563,13 +564,7 @@ def _prefilter_slips(controller: Controller, right: float) -> Iterator[tuple[str
         yield WORDS.text("prefilter_open"), 1 / float(chain.static_gains()[goal.cart - 1])
     for cart in range(1, chain.n + 1):
         if cart != goal.cart and controller.gains is not None:
-            other = loop_numbers(
-                chain,
-                controller.gains,
-                cart=cart,
-                settling=goal.settling_time,
-                sample_time=goal.sample_time,
-            )
+            other = controller.on(chain, controller.gains, cart=cart)
             if other is not None:
                 sentence = WORDS.text("prefilter_of_other", cart=cart, goal=goal.cart)
                 yield sentence, other.prefilter

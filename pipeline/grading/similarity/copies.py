@@ -16,20 +16,8 @@ import numpy as np
 
 from pipeline.grading.gradings import Grading
 from pipeline.grading.platforms import same_number
+from pipeline.grading.similarity import noise
 from pipeline.grading.similarity.fingerprints import PASSED, Fingerprint, unpack
-from pipeline.grading.similarity.noise import (
-    LEAST_OVERLAP,
-    LEAST_SLOPE,
-    Agreement,
-    Heard,
-    Match,
-    agreements,
-    compare,
-    copied,
-    equal_rows,
-    padded_length,
-    usual,
-)
 from pipeline.grading.similarity.releases import Releases, chance, is_decay, usual_parts
 
 _WIDTH = 512  # samples around an anchor that the first comparison uses
@@ -116,7 +104,7 @@ def find_copies(
         *(Grading(submission="", authors=(), fingerprints=packed) for packed in examples),
     ]
     groups = _by_group(owners)
-    equal: dict[tuple[int, int], list[Match]] = defaultdict(list)
+    equal: dict[tuple[int, int], list[noise.Match]] = defaultdict(list)
     total: dict[tuple[int, int], float] = defaultdict(float)
     for _, entries in sorted(groups.items()):
         for pair, match in _equal(
@@ -130,7 +118,7 @@ def find_copies(
         if b >= len(everyone)
         for one in found
     }
-    proof: dict[tuple[int, int], list[Match]] = {}
+    proof: dict[tuple[int, int], list[noise.Match]] = {}
     for pair, found in equal.items():
         own = [one for one in found if given.isdisjoint(zip(pair, one.experiments, strict=True))]
         proof[pair] = _decisive(own, compared=compared) if pair[1] < len(everyone) else []
@@ -162,7 +150,7 @@ def _by_group(owners: Iterable[Grading]) -> dict[str, list[_Owned]]:
     return groups
 
 
-def _record_of(one: Match, mine: int, other: int, *, submission: str) -> SharedRecord:
+def _record_of(one: noise.Match, mine: int, other: int, *, submission: str) -> SharedRecord:
     """Return a match as seen from one of the two submissions."""
     return SharedRecord(
         experiment=one.experiments[mine],
@@ -195,14 +183,14 @@ def same_recordings(a: Grading, b: Grading) -> bool:
     return bool(of_a and of_b) and (of_a <= of_b or of_b <= of_a)
 
 
-def _decisive(found: Sequence[Match], *, compared: int) -> list[Match]:
+def _decisive(found: Sequence[noise.Match], *, compared: int) -> list[noise.Match]:
     """Return the matches of two submissions, one per recording, if together they prove a copy.
 
     Parameters
     ----------
     compared : number of pairs of recordings in which chance could have made a match.
     """
-    chosen: list[Match] = []
+    chosen: list[noise.Match] = []
     for one in sorted(found, key=lambda one: (-one.different, -one.sigmas, one.experiments)):
         a, b = one.experiments
         if all(a != c.experiments[0] and b != c.experiments[1] for c in chosen):
@@ -232,11 +220,12 @@ class _Pairs:
             for entry in found:
                 self._prints[entry.owner][group].append(entry.print)
         self._lengths = {
-            group: padded_length([one.print for one in found]) for group, found in groups.items()
+            group: noise.padded_length([one.print for one in found])
+            for group, found in groups.items()
         }
         # Spectra take up to 5 MB for each submission.
         self._of = lru_cache(maxsize=_SPECTRA_KEPT)(self._heard)
-        self._found: dict[tuple[int, int], list[Agreement]] = {}
+        self._found: dict[tuple[int, int], list[noise.Agreement]] = {}
         releases = {a: Releases(self._prints[a]) for a in range(len(everyone))}
         self._delays = {
             (a, b): releases[a].delays_to(releases[b])
@@ -246,9 +235,9 @@ class _Pairs:
         }
         self._usual = usual_parts([one for found in self._delays.values() for one in found])
 
-    def _heard(self, submission: int) -> dict[str, list[Heard]]:
+    def _heard(self, submission: int) -> dict[str, list[noise.Heard]]:
         return {
-            group: [Heard(print=one, length=self._lengths[group]) for one in prints]
+            group: [noise.Heard(print=one, length=self._lengths[group]) for one in prints]
             for group, prints in self._prints[submission].items()
         }
 
@@ -282,8 +271,8 @@ class _Pairs:
         return chance(found, of=of, usual=self._usual)
 
     def shared(
-        self, pair: tuple[int, int], given: Container[tuple[int, str]], known: Iterable[Match]
-    ) -> list[Match]:
+        self, pair: tuple[int, int], given: Container[tuple[int, str]], known: Iterable[noise.Match]
+    ) -> list[noise.Match]:
         """Return the recordings that two submissions share according to noise and releases.
 
         Parameters
@@ -297,10 +286,12 @@ class _Pairs:
             if not any((pair[side], one.of(side)) in given for side in (0, 1))
         ]
         others = self._others(pair)
-        proof = partial(copied, found, releases=self._chance(pair, given), pairs=len(self._delays))
+        proof = partial(
+            noise.copied, found, releases=self._chance(pair, given), pairs=len(self._delays)
+        )
         if len(others) < _FEWEST_TEAMS or not proof():
             return []
-        a, b = (usual(self._seen_from(own, c) for c in others) for own in pair)
+        a, b = (noise.usual(self._seen_from(own, c) for c in others) for own in pair)
         told = {one.experiments for one in known}
         return [
             one.match_of(sigmas)
@@ -318,7 +309,7 @@ class _Pairs:
         ]
         return teams[:: max(1, len(teams) // _MOST_TEAMS)]
 
-    def _seen_from(self, own: int, other: int) -> tuple[list[Agreement], int]:
+    def _seen_from(self, own: int, other: int) -> tuple[list[noise.Agreement], int]:
         """Return the agreements of two submissions, and which side the first one is."""
         first, second = sorted((own, other))
         return self._agreements(first, second), int(own != first)
@@ -326,10 +317,10 @@ class _Pairs:
     def _same_team(self, a: int, b: int) -> bool:
         return a == b or same_team(self._everyone[a], self._everyone[b])
 
-    def _agreements(self, a: int, b: int) -> list[Agreement]:
+    def _agreements(self, a: int, b: int) -> list[noise.Agreement]:
         if (a, b) not in self._found:
             delays = self._delays.get((a, b), ())
-            self._found[a, b] = agreements(self._of(a), self._of(b), delays)
+            self._found[a, b] = noise.agreements(self._of(a), self._of(b), delays)
         return self._found[a, b]
 
 
@@ -343,14 +334,14 @@ def _equal(
     everyone: int,
     owners: Sequence[Grading],
     total: dict[tuple[int, int], float],
-) -> Iterator[tuple[tuple[int, int], Match]]:
+) -> Iterator[tuple[tuple[int, int], noise.Match]]:
     """Yield pairs of recordings with equal rows from different teams, each with its two owners.
 
     Parameters
     ----------
     total : the similarity of submissions, to which these recordings are added.
     """
-    best: dict[tuple[int, int], Match] = {}
+    best: dict[tuple[int, int], noise.Match] = {}
     most: dict[tuple[int, int], float] = defaultdict(lambda: _LEAST_ALIKE)  # best similarity so far
     seen: set[tuple[int, int, int]] = set()
 
@@ -378,11 +369,11 @@ def _equal(
         if compared[pair] > _MOST_COMPARED * (recordings[a.owner] + recordings[b.owner]):
             continue
         total[pair] += sigmas**2
-        match = compare(a.print, b.print, shift=shift)
-        if match.slope < LEAST_SLOPE or match.sigmas <= most[i, j]:
+        match = noise.compare(a.print, b.print, shift=shift)
+        if match.slope < noise.LEAST_SLOPE or match.sigmas <= most[i, j]:
             continue
         most[i, j] = match.sigmas
-        if equal := equal_rows(a.print, b.print, shift=shift):
+        if equal := noise.equal_rows(a.print, b.print, shift=shift):
             best[i, j] = replace(equal, slope=match.slope, sigmas=match.sigmas)
             partner[i, b.owner], partner[j, a.owner] = j, i
     for (i, j), match in sorted(best.items(), key=lambda one: one[0]):
@@ -439,4 +430,4 @@ def _windows(entries: Sequence[_Owned], places: Sequence[tuple[int, int]]) -> np
     counts = np.count_nonzero(flat, axis=1)
     power = np.einsum("ij,ij->i", flat, flat)
     factor = (PASSED * counts) ** 0.25 / np.sqrt(np.maximum(power, 1.0))
-    return flat * np.where(counts >= LEAST_OVERLAP, factor, 0.0).astype(np.float32)[:, None]
+    return flat * np.where(counts >= noise.LEAST_OVERLAP, factor, 0.0).astype(np.float32)[:, None]

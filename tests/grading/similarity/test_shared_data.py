@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.grading.gradings import Grading
-from pipeline.grading.similarity import copies
+from pipeline.grading.similarity import noise
 from pipeline.grading.similarity.copies import find_copies, same_recordings
 from pipeline.grading.similarity.fingerprints import fingerprint, unpack
 from pipeline.grading.similarity.shared_flag import shared_flag
@@ -290,13 +290,13 @@ def test_a_copy_from_an_earlier_batch_is_found(teams):
 @pytest.fixture
 def compared(monkeypatch):
     """Return a list to which each comparison at one time shift adds its pair of recordings."""
-    pairs, compare = [], copies.compare
+    pairs, compare = [], noise.compare
 
     def counted(a, b, **how):
         pairs.append((a.experiment, b.experiment))
         return compare(a, b, **how)
 
-    monkeypatch.setattr(copies, "compare", counted)
+    monkeypatch.setattr(noise, "compare", counted)
     return pairs
 
 
@@ -374,8 +374,8 @@ def test_in_a_small_class_only_equal_rows_are_flagged(teams, members):
     rng = np.random.default_rng(2)
     record = of_kind(teams[0], "step")
     others = [prints(str(number), teams[number]) for number in range(2, members)]
-    for noise, told in ((0.0, {"a", "b"}), (0.4, set())):
-        copied = disguised(record, rng, noise=noise, keep=0.8, later=2.0)
+    for counts, told in ((0.0, {"a", "b"}), (0.4, set())):
+        copied = disguised(record, rng, noise=counts, keep=0.8, later=2.0)
         b = prints("b", [*teams[1], copied])
         assert set(find_copies([prints("a", teams[0]), b, *others])) == told
 
