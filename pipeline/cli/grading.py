@@ -16,7 +16,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.platforms import PLATFORMS
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, ProgressColumn
+    from rich.progress import Progress
 
     from pipeline.grading.batch.grade_class import Summary
     from pipeline.grading.gradebook.gradebook import Gradebook
@@ -122,32 +122,21 @@ def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
         with log_progress() as show:
             yield lambda done, total, last: show(f"{done} of {total}: {last}".rstrip(": "))
         return
+    from rich import progress
     from rich.console import Console
-    from rich.progress import Progress
 
-    with Progress(*columns(), console=Console(stderr=True), transient=True) as shown:
+    # "3/40 ━━━ 0:00:06 so far, 0:01:05 to go, team-3"
+    parts = (
+        progress.MofNCompleteColumn(),
+        progress.BarColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("so far,"),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("to go,"),
+        progress.TextColumn("{task.description}", markup=False),  # a submission may be called "[b]"
+    )
+    with progress.Progress(*parts, console=Console(stderr=True), transient=True) as shown:
         yield counting(shown)
-
-
-def columns() -> "tuple[ProgressColumn, ...]":
-    """Return the columns of a progress line: "3/40 ━━━ 0:00:06 so far, 0:01:05 to go, team-3"."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    return (
-        MofNCompleteColumn(),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TextColumn("so far,"),
-        TimeRemainingColumn(),
-        TextColumn("to go,"),
-        TextColumn("{task.description}", markup=False),  # a submission may be called "[b]"
-    )
 
 
 def counting(shown: "Progress") -> Callable[[int, int, str], None]:

@@ -17,7 +17,6 @@ import tempfile
 from collections.abc import Iterator, Set
 from pathlib import Path
 
-from packaging.markers import Marker
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
@@ -123,13 +122,10 @@ def pin_requirements(package: str = "cartlab") -> list[str]:
         if name != package:
             pinned[canonicalize_name(name)] = Version(found.version).public
         for needed in map(Requirement, found.requires or ()):
-            if _applies(needed.marker, extra):
+            marker = needed.marker
+            if marker is None or marker.evaluate({**_LINUX, "extra": extra}):
                 waiting += [(needed.name, more) for more in ("", *needed.extras)]
     return [f"{name}=={version}" for name, version in sorted(pinned.items())]
-
-
-def _applies(marker: Marker | None, extra: str) -> bool:
-    return marker is None or marker.evaluate({**_LINUX, "extra": extra})
 
 
 _SCRIPTS = TEMPLATES / "gradescope"
@@ -160,10 +156,8 @@ def write_autograder(rubric_file: Path, out: Path) -> tuple[str, ...]:
 def _files(text: str, rubric: Rubric) -> Iterator[tuple[str, bytes]]:
     """Yield the name and content of each file in the zip."""
     for script in _SCRIPTS.iterdir():
-        yield (
-            script.name,
-            script.read_bytes().replace(b"\r\n", b"\n"),
-        )  # bash cannot read Windows line ends
+        # bash cannot read Windows line ends
+        yield script.name, script.read_bytes().replace(b"\r\n", b"\n")
     yield "python-version", f"{sys.version_info.major}.{sys.version_info.minor}\n".encode()
     head = f"# cartlab {pipeline.__version__} was installed with:"
     yield "requirements.txt", "\n".join([head, *pin_requirements(), ""]).encode()

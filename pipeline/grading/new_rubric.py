@@ -408,19 +408,10 @@ def _patterns(names: Sequence[str], every: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(found))
 
 
-def _typed(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table whose numbers are written without superfluous digits."""
-
-    def plain(value: Any) -> Any:
-        match value:
-            case bool() | str() | int():
-                return value
-            case float():
-                return TypedNumber(f"{value:.10g}")
-            case Mapping():
-                return _typed(value)
-            case Sequence():
-                return [plain(one) for one in value]
-        return value
-
-    return {key: plain(value) for key, value in table.items()}
+def _typed(value: Any) -> Any:
+    """Return a value or a table whose numbers are written without superfluous digits."""
+    if isinstance(value, float):
+        return TypedNumber(f"{value:.10g}")
+    if isinstance(value, Mapping):
+        return {key: _typed(one) for key, one in value.items()}
+    return [_typed(one) for one in value] if isinstance(value, list | tuple) else value

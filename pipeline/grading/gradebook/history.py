@@ -142,13 +142,8 @@ def _counted(given: Sequence[Event], authors: tuple[str, ...]) -> list[Event]:
     """Return the points by hand, comments and adjustments that count for these authors."""
     theirs = [event for event in given if event.concerns(authors)]
     last = {event.criterion: event for event in theirs if event.what != "adjusted"}
-    removed = [e for e in last.values() if e.what == "override" and e.points is None]
-    return [
-        event
-        for event in theirs
-        if event.what == "adjusted" or event in last.values()
-        if event not in removed
-    ]
+    counting = [e for e in last.values() if e.what == "comment" or e.points is not None]
+    return [event for event in theirs if event.what == "adjusted" or event in counting]
 
 
 def _points_words(given: Sequence[Event]) -> str:

@@ -90,18 +90,12 @@ def grade_submission(
     ----------
     bench : the team's bench in an answer key; see `HandIn`.
     """
-
-    def failed(reason: str) -> Graded:
-        authors = tuple(author.id for author in submission.authors)
-        grade = Grade.failed(
-            name, reason, out_of=rubric.out_of, authors=authors, days_late=days_late
-        )
-        return Graded(grade=grade, analysis=None)
-
     try:
         judged = analyse_under(submission, rubric=rubric, progress=progress)
     except SubmissionError as error:
-        return failed(str(error))
+        authors = tuple(author.id for author in submission.authors)
+        given = {"out_of": rubric.out_of, "authors": authors, "days_late": days_late}
+        return Graded(grade=Grade.failed(name, str(error), **given), analysis=None)
     springs, notes, analysis = judged.springs, judged.notes, judged.analysis
     if springs:
         lacking = "judged with springs that the recordings need but the rubric lacks"

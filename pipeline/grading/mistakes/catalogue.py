@@ -13,7 +13,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.bode_fit import fit_bode
 from pipeline.grading import limits
 from pipeline.grading.grade import Code
-from pipeline.grading.mistakes.factors import FACTORS, LOG10, TURN, Factor, Of
+from pipeline.grading.mistakes.factors import FACTORS, LOG10, OF_MISTAKE, TURN, Of
 from pipeline.grading.reference import Reference, StepTurns, is_explained, step_turns
 from pipeline.grading.tolerance import as_typed
 from pipeline.grading.words import WORDS
@@ -188,22 +188,16 @@ def _by_factor(of: Mapping[str, Numbers], *groups: Of) -> list[Mistake]:
         alone = row.of == "sharp dampings"
         for some in [{n: r} for n, r in numbers.items()] if alone else [numbers]:
             beside = [n for n in of["own frequencies"] if alone and _damping(n) in some]
-            found.append(_mistake(row, some, beside=frozenset(beside)))
+            found.append(
+                Mistake(
+                    codes=(row.code,),
+                    advice_keys=(row.advice_key,),
+                    predicted=_times(some, row.factor),
+                    beside=frozenset(beside),
+                    **{name: getattr(row, name) for name in OF_MISTAKE},
+                )
+            )
     return found
-
-
-def _mistake(row: Factor, numbers: Numbers, *, beside: frozenset[str]) -> Mistake:
-    return Mistake(
-        codes=(row.code,),
-        advice_keys=(row.advice_key,),
-        predicted=_times(numbers, row.factor),
-        tolerance=row.tolerance,
-        whole=row.whole,
-        least=row.least,
-        tries=row.tries,
-        beside=beside,
-        from_time_records=row.from_time_records,
-    )
 
 
 def _times(references: Numbers, factor: float) -> dict[str, Reference]:

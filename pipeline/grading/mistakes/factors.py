@@ -52,6 +52,7 @@ class Factor:
     from_time_records: bool = False
 
 
+OF_MISTAKE = ("tolerance", "whole", "least", "tries", "from_time_records")  # as in `Mistake`
 _CLEAR, _READ = limits.UNMISTAKABLE, limits.READ
 _LOG10 = {"tolerance": limits.LOG10_DAMPING, "whole": True, "from_time_records": True}
 _DECREMENT = {"tolerance": _READ, "tries": 2, "from_time_records": True}

@@ -37,10 +37,9 @@ def diagnose_reduced(analysis: Analysis) -> list[Flag]:
     rows = _rows(analysis, stretch=1.0)
     if rows is not None and _share(rows.reported, rows.measured) >= limits.ENOUGH_ROWS:
         return []
-    slips = [(_share(slip.rows.reported, slip.predicted), slip) for slip in _slips(analysis, rows)]
-    share, best = max(slips, key=lambda one: one[0], default=(0.0, None))
+    share, best = max(_slips(analysis, rows), key=lambda one: one[0], default=(0.0, None))
     if best is not None and share >= limits.MOST_ROWS:
-        return [_flag(best.code, best.advice_key, best.rows)]
+        return [_flag(*best)]
     if rows is None:
         return []
     ratio = float(np.median(np.abs(np.log(rows.reported / rows.measured))))
@@ -85,36 +84,26 @@ def _share(reported: Array, predicted: Array) -> float:
         return float(np.mean(np.abs(np.log(reported / predicted)) <= MISREAD_RATIO))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Slip:
-    """A known mistake, the key of its sentence, and the ratios that it predicts for rows."""
+def _slips(
+    analysis: Analysis, rows: _Rows | None
+) -> Iterator[tuple[float, tuple[Code, str, _Rows]]]:
+    """Yield the known mistakes that affect the whole table: code, key of the sentence, and rows.
 
-    code: Code
-    advice_key: str
-    predicted: Array
-    rows: _Rows
-
-
-def _slips(analysis: Analysis, rows: _Rows | None) -> Iterator[_Slip]:
-    """Yield the known mistakes that affect the whole table."""
+    Each comes after the share of the rows that it predicts.
+    """
     for row in [row for row in FACTORS if row.of == "frequencies of rows"]:
-        moved = _rows(analysis, stretch=row.factor)
-        if moved is not None:
-            yield _Slip(
-                code=row.code, advice_key=row.advice_key, predicted=moved.measured, rows=moved
-            )
+        if moved := _rows(analysis, stretch=row.factor):
+            yield _share(moved.reported, moved.measured), (row.code, row.advice_key, moved)
     if rows is None:
         return
     for row in [row for row in FACTORS if row.of == "ratios of rows"]:
-        predicted = row.factor * rows.measured
-        yield _Slip(code=row.code, advice_key=row.advice_key, predicted=predicted, rows=rows)
+        share = _share(rows.reported, row.factor * rows.measured)
+        yield share, (row.code, row.advice_key, rows)
     counts = [r.encoder_step(int(c)) for r in analysis.records for c in r.carts]
     count = float(np.median(counts)) if counts else 0.0
     if count not in (0.0, 1.0):
-        predicted = rows.measured / count
-        yield _Slip(
-            code="counts_for_length", advice_key="reduced_counts", predicted=predicted, rows=rows
-        )
+        share = _share(rows.reported, rows.measured / count)
+        yield share, ("counts_for_length", "reduced_counts", rows)
 
 
 def _flag(code: Code, advice_key: str, rows: _Rows) -> Flag:

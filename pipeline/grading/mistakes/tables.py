@@ -75,76 +75,69 @@ def diagnose_tables(
     for label, one in judged.items():
         rest = [n for n in found[label].left if one.errors[n] > limit(n, label)]
         broken = one.broken_laws(set(rest))
-        flags += [law.flag(tables[label], label) for law in broken]
-        impossible = {name for law in broken for name in law.names}
-        left[label] = [name for name in rest if name not in impossible]
-        out_of_order[label] = impossible
+        flags += [law.flag(one.table, label) for law in broken]
+        out_of_order[label] = {name for law in broken for name in law.names}
+        left[label] = [name for name in rest if name not in out_of_order[label]]
     if copied:
         flags.append(copied_flag(reported, copied, references))
-    explained = [
-        e
-        for label, one in found.items()
-        for e in one.explained
-        if not judged[label].suspect.isdisjoint(e.names)
-    ]
-    flags += specific_flags(explained, tables, references)
+    explained: dict[Label, list[ExplainedNumbers]] = {
+        label: [e for e in found[label].explained if not one.suspect.isdisjoint(e.names)]
+        for label, one in judged.items()
+    }
+    every = [one for own in explained.values() for one in own]
+    flags += specific_flags(every, tables, references)
     flags += [
         off_flag(tables[label], names, getattr(references, label), label)
         for label, names in left.items()
         if names
     ]
-    named = {name for flag in flags for name in flag.parameters}
-    # A mistake in one table makes the tables differ, even in numbers that the recordings do not
-    # give.
-    symbols = {read_name(name).symbol for one in explained for name in one.names}
-    # On a nonlinear bench, estimates from large and small motions may differ.
-    apart = [
-        (size, name)
-        for size, name in _disagreements(reported, references, blurred=True)
-        if is_linear(analysis) and name not in named and read_name(name).symbol not in symbols
-    ]
-    if apart:
+    if apart := _apart(reported, references, analysis, flags, every):
         flags.append(disagreement_flag(reported, apart))
-    named_slips: dict[Label, list[Slipped]] = {
-        label: _named(
-            tables[label], [e for e in explained if e.table == label], known=one.all_known
+    named: dict[Label, frozenset[str]] = {}
+    slipped: dict[Label, tuple[Slipped, ...]] = {}
+    corrected: dict[str, float] = {}
+    for label, one in judged.items():
+        known = _named(one.table, explained[label], known=one.all_known)
+        wide = {n: e.mistake.codes[0] for e in explained[label] for n in e.names}
+        unknown = _unnamed(
+            one,
+            known,
+            wide=wide,
+            left=left[label],
+            out_of_order=out_of_order[label],
+            copied=copied if label == "final" else (),
         )
-        for label, one in judged.items()
-    }
-    slipped: dict[Label, tuple[Slipped, ...]] = {
-        label: (
-            *named_slips[label],
-            *_unnamed(
-                one,
-                named_slips[label],
-                wide={
-                    n: e.mistake.codes[0] for e in explained if e.table == label for n in e.names
-                },
-                left=left[label],
-                out_of_order=out_of_order[label],
-                copied=copied if label == "final" else (),
-            ),
-        )
-        for label, one in judged.items()
-    }
-    corrected = {
-        name: float(number.value)
-        for name, number in undo(reported.final, named_slips["final"], left=()).items()
-        if number.value > 0
-    }
+        named[label], slipped[label] = frozenset(wide), (*known, *unknown)
+        numbers = undo(one.table, known, left=())
+        corrected = {x: float(number.value) for x, number in numbers.items() if number.value > 0}
     corrected |= {name: references.final[name].value for name in left["final"]}
-    named_in: dict[Label, frozenset[str]] = {
-        label: frozenset(n for e in explained if e.table == label for n in e.names)
-        for label in tables
-    }
     possible = not broken_orders({n: Decimal(v) for n, v in corrected.items()}, initial=False)
     return Diagnosis(
-        flags=tuple(flags),
-        corrected=corrected,
-        named=named_in,
-        slipped=slipped,
-        possible=possible,
+        flags=tuple(flags), corrected=corrected, named=named, slipped=slipped, possible=possible
     )
+
+
+def _apart(
+    reported: Reported,
+    references: References,
+    analysis: Analysis,
+    flags: Sequence[Flag],
+    explained: Sequence[ExplainedNumbers],
+) -> list[tuple[float, str]]:
+    """Return the numbers that differ between the tables for a reason that no flag gives.
+
+    A mistake in one table makes the tables differ, even in numbers that the recordings do not
+    give. On a nonlinear bench, estimates from large and small motions may differ.
+    """
+    if not is_linear(analysis):
+        return []
+    named = {name for flag in flags for name in flag.parameters}
+    symbols = {read_name(name).symbol for one in explained for name in one.names}
+    return [
+        (size, name)
+        for size, name in _disagreements(reported, references, blurred=True)
+        if name not in named and read_name(name).symbol not in symbols
+    ]
 
 
 def _named(

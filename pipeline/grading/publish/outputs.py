@@ -134,17 +134,12 @@ def repeated_authors_of(
     found = with_recordings(found, book.fingerprints([gradings[name] for name in concerned]))
     if names is None:
         return found
-    return sorted(
-        (
-            replace(
-                people,
-                authors=("",) * len(people.authors),
-                submissions=tuple(sorted(names[s] for s in people.submissions)),
-            )
-            for people in found
-        ),
-        key=lambda people: people.submissions,
-    )
+
+    def hidden(people: RepeatedAuthors) -> RepeatedAuthors:
+        shown = tuple(sorted(names[name] for name in people.submissions))
+        return replace(people, authors=("",) * len(people.authors), submissions=shown)
+
+    return sorted(map(hidden, found), key=lambda people: people.submissions)
 
 
 def grades_csv(grades: Sequence[Grade], *, rubric: Rubric, held: Collection[str] = ()) -> str:

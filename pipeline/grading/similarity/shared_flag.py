@@ -163,20 +163,15 @@ def renamed(clusters: Iterable[Cluster], names: Mapping[str, str], *, other: str
     ----------
     other : the new name of submissions that are not in `names`.
     """
-    return sorted(
-        (
-            Cluster(
-                recordings=tuple(
-                    sorted(
-                        tuple(sorted((names.get(name, other), id_) for name, id_ in recording))
-                        for recording in cluster.recordings
-                    )
-                )
-            )
-            for cluster in clusters
-        ),
-        key=lambda cluster: cluster.recordings,
-    )
+
+    def hidden(cluster: Cluster) -> Cluster:
+        recordings = (
+            tuple(sorted((names.get(name, other), id_) for name, id_ in recording))
+            for recording in cluster.recordings
+        )
+        return Cluster(recordings=tuple(sorted(recordings)))
+
+    return sorted(map(hidden, clusters), key=lambda cluster: cluster.recordings)
 
 
 def _joined(pairs: Sequence[tuple[Any, Any]]) -> list[tuple[Any, ...]]:

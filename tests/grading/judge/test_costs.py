@@ -119,8 +119,9 @@ def test_a_slightly_wrong_model_is_not_harmful(preset):
         off[A == 1.0] = 1.0
         grown += bool(np.linalg.eigvals(off).real.max() > 0)
         space = space_of(off, B[:, 0])
-        entries = compare_entries(space, models=models, n=chain.n)
-        harm = model_harm(space, entries, models=models, n=chain.n, tied=chain.is_tied)
+        given = {"models": models, "n": chain.n, "order": tuple(range(2 * chain.n))}
+        entries = compare_entries(space, **given)
+        harm = model_harm(space, entries, tied=chain.is_tied, **given)
         assert harm is None
     assert bool(grown) == (chain.n == 3)
 
