@@ -3,7 +3,7 @@
 A number that somebody copies from another team is then wrong, whatever the recordings show.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -162,10 +162,5 @@ def with_benches(hand_ins: Sequence[HandIn], key: Path) -> tuple[list[HandIn], t
     ConfigError : the file is not an answer key.
     """
     teams = {name.casefold(): json_text(one) for name, one in read_key(key).teams.items()}
-
-    def named() -> Iterator[HandIn]:
-        for one in hand_ins:
-            yield replace(one, bench=teams.get(one.id.casefold(), ""))
-
-    found = list(named())
+    found = [replace(one, bench=teams.get(one.id.casefold(), "")) for one in hand_ins]
     return found, tuple(one.id for one in found if not one.bench)

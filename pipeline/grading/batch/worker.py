@@ -5,6 +5,7 @@ import tempfile
 import tomllib
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,12 +39,7 @@ def grade_hand_in(
     reason = detail = original = by = ""
     settled, no_room = True, False
     try:
-        with tempfile.TemporaryDirectory(
-            dir=scratch, prefix="open-", ignore_cleanup_errors=True
-        ) as folder:
-            opened = _open(hand_in, Path(folder))
-            original = _handed_in(opened)
-            repaired = _repair(opened, hand_in, original)
+        with _opened(hand_in, scratch) as (opened, original, repaired):
             by = f"by {repaired.by}: {repaired.why}" if repaired else ""
             authors = named_authors(opened)
             submission = load_submission(opened)
@@ -110,16 +106,20 @@ def read_authors(hand_in: HandIn, *, scratch: Path) -> tuple[str, ...]:
     ------
     PipelineError, OSError : as for `open_submission`.
     """
+    with _opened(hand_in, scratch) as (folder, _, _):
+        return named_authors(folder)
+
+
+@contextmanager
+def _opened(hand_in: HandIn, scratch: Path) -> Iterator[tuple[Path, str, Repair | None]]:
+    """Open a private copy of a submission; yield its folder, the text handed in, and its repair."""
     with tempfile.TemporaryDirectory(
         dir=scratch, prefix="open-", ignore_cleanup_errors=True
     ) as folder:
-        opened = _open(hand_in, Path(folder))
-        _repair(opened, hand_in, _handed_in(opened))
-        return named_authors(opened)
-
-
-def _open(hand_in: HandIn, scratch: Path) -> Path:
-    return open_submission(hand_in.sources, scratch / hand_in.id, digest=hand_in.digest)
+        into = Path(folder) / hand_in.id
+        opened = open_submission(hand_in.sources, into, digest=hand_in.digest)
+        original = _handed_in(opened)
+        yield opened, original, _repair(opened, hand_in, original)
 
 
 def _handed_in(folder: Path) -> str:

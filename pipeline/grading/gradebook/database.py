@@ -4,7 +4,7 @@ import os
 import stat
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -105,17 +105,13 @@ class Database:
             return url.database or ""
         return url.render_as_string(hide_password=True)
 
-    @contextmanager
-    def reading(self) -> Iterator[Connection]:
+    def reading(self) -> AbstractContextManager[Connection]:
         """Read the data of one moment; keep it short, because writers wait for it."""
-        with self._transaction(self._reader) as connection:
-            yield connection
+        return self._transaction(self._reader)
 
-    @contextmanager
-    def writing(self) -> Iterator[Connection]:
+    def writing(self) -> AbstractContextManager[Connection]:
         """Write all changes or none; at the end they are on disk."""
-        with self._transaction(self._writer) as connection:
-            yield connection
+        return self._transaction(self._writer)
 
     @contextmanager
     def changing(self) -> Iterator[Connection]:

@@ -145,23 +145,13 @@ def unpack(packed: bytes) -> tuple[Fingerprint, ...]:
     head, _, body = zlib.decompress(packed).partition(b"\0")
     prints, at = [], 0
     for entry in json.loads(head):
-        if entry.get("every") != EVERY:
+        if entry.pop("every", None) != EVERY:
             return ()
-        rows, columns = entry["shape"]
+        rows, columns = entry.pop("shape")
         residual = np.frombuffer(body, _STORED, rows * columns, at).reshape(rows, columns)
         at += residual.nbytes
-        prints.append(
-            Fingerprint(
-                experiment=entry["experiment"],
-                group=entry["group"],
-                residual=residual,
-                step=np.array(entry["step"]),
-                anchors=entry["anchors"],
-                motion=np.array(entry["motion"]),
-                start=entry["start"],
-                interval=entry["interval"],
-            )
-        )
+        arrays = {name: np.array(entry.pop(name)) for name in ("step", "motion")}
+        prints.append(Fingerprint(residual=residual, **arrays, **entry))
     return tuple(prints)
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.grading.similarity.fingerprints import EVERY, PASSED, STEPS_PER_SIGMA, Fingerprint
-from pipeline.grading.similarity.releases import Delay, is_decay
+from pipeline.grading.similarity.releases import Delay, is_decay, shifted_products
 
 LEAST_OVERLAP = 80  # smallest number of samples in which both recordings have noise
 LEAST_SLOPE = 0.5
@@ -302,15 +302,9 @@ def _motion_shifts(a: Array, b: Array) -> list[int]:
 
     An oscillation agrees again after half a period.
     """
-    from scipy.fft import irfft, next_fast_len, rfft
-
-    length = next_fast_len(a.size + b.size, real=True) or 1
     a, b = a - a.mean(), b - b.mean()
-    of_a, of_b = (np.asarray(rfft(x, length)) for x in (a, b))
-    products = np.asarray(irfft(np.conj(of_a) * of_b, length))
     least = max(1, round(_LEAST_SHARE * min(a.size, b.size)))
-    shifts = np.arange(least - a.size, b.size - least + 1)
-    first, last = np.maximum(0, -shifts), np.minimum(a.size, b.size - shifts)
+    shifts, first, last, products = shifted_products(a, b, least=least)
     means: list[Array] = []
     n, power = last - first, np.ones(shifts.size)
     for x, start, end in ((a, first, last), (b, first + shifts, last + shifts)):
@@ -318,7 +312,7 @@ def _motion_shifts(a: Array, b: Array) -> list[int]:
         mean = (total[end] - total[start]) / n
         power *= np.maximum(squares[end] - squares[start] - n * mean**2, 1e-30)
         means.append(mean)
-    alike = np.abs(products[shifts] - n * means[0] * means[1]) / np.sqrt(power)
+    alike = np.abs(products - n * means[0] * means[1]) / np.sqrt(power)
     inner = alike[1:-1]
     peaks = 1 + np.flatnonzero((inner >= alike[:-2]) & (inner > alike[2:]))
     found = []

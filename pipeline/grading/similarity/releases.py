@@ -33,6 +33,27 @@ def is_decay(group: str) -> bool:
     return group.startswith("decay")
 
 
+def shifted_products(x: Array, y: Array, *, least: int) -> tuple[Array, Array, Array, Array]:
+    """Return the sums of products of two signals at every shift, by the convolution theorem.
+
+    Parameters
+    ----------
+    least : smallest number of samples in which both signals overlap.
+
+    Returns
+    -------
+    The shifts, for each of them the first sample of `x` that overlaps and the one after the last,
+    and the sum of x_i y_(i + shift).
+    """
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    length = next_fast_len(x.size + y.size, real=True) or 1
+    of_x, of_y = (np.asarray(rfft(z, length)) for z in (x, y))
+    shifts = np.arange(least - x.size, y.size - least + 1)
+    products = np.asarray(irfft(np.conj(of_x) * of_y, length))[shifts]
+    return shifts, np.maximum(0, -shifts), np.minimum(x.size, y.size - shifts), products
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Delay:
     """Two decays that are one motion, with the time between them.
@@ -78,21 +99,15 @@ class Motion:
 
     def _near(self, other: "Motion", *, scale: float) -> list[float]:
         """Return the delays at which the stored values correspond, the best scale first."""
-        from scipy.fft import irfft, next_fast_len, rfft
-
         x, y = self.values, other.values
-        length = next_fast_len(x.size + y.size, real=True) or 1
-        of_x, of_y = (np.asarray(rfft(z, length)) for z in (x, y))
-        products = np.asarray(irfft(np.conj(of_x) * of_y, length))
         least = max(_FEWEST, round(_LEAST_OVERLAP * min(x.size, y.size)))
-        shifts = np.arange(least - x.size, y.size - least + 1)
-        if shifts.size < 3:
+        if x.size + y.size - 2 * least < 2:  # fewer than three shifts
             return []
-        first, last = np.maximum(0, -shifts), np.minimum(x.size, y.size - shifts)
+        shifts, first, last, products = shifted_products(x, y, least=least)
         in_x, in_y = (np.append(0.0, np.cumsum(z * z)) for z in (x, y))
         squares = in_x[last] - in_x[first] + 1e-30
         others = in_y[last + shifts] - in_y[first + shifts] + 1e-30
-        alike = np.abs(products[shifts]) / np.sqrt(squares * others)
+        alike = np.abs(products) / np.sqrt(squares * others)
         off = np.abs(np.sqrt(others / squares) / scale - 1)
         before, inner, after = alike[:-2], alike[1:-1], alike[2:]
         peaks = np.flatnonzero((inner >= before) & (inner > after) & (off[1:-1] < _NEAR_SCALE))
