@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import sqlalchemy as sa
+from sqlalchemy import event
 
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.events import TOTAL
@@ -167,7 +168,7 @@ events = sa.Table(
 )
 
 _REFUSE = "entries of a gradebook cannot be changed"
-sa.event.listen(
+event.listen(
     metadata,
     "before_create",
     sa.DDL(
@@ -199,7 +200,7 @@ def _locks(table: sa.Table, dialect: str) -> list[tuple[str, str]]:
 for _table in metadata.sorted_tables:
     for _dialect in ("sqlite", "postgresql"):
         for _lock, _ in _locks(_table, _dialect):
-            sa.event.listen(_table, "after_create", sa.DDL(_lock).execute_if(dialect=_dialect))
+            event.listen(_table, "after_create", sa.DDL(_lock).execute_if(dialect=_dialect))
 
 
 @contextmanager

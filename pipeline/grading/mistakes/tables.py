@@ -98,7 +98,7 @@ def diagnose_tables(
     corrected: dict[str, float] = {}
     for label, one in judged.items():
         known = _named(one.table, explained[label], known=one.all_known)
-        wide = {n: e.mistake.codes[0] for e in explained[label] for n in e.names}
+        wide: dict[str, Code] = {n: e.mistake.codes[0] for e in explained[label] for n in e.names}
         unknown = _unnamed(
             one,
             known,

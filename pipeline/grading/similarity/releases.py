@@ -33,7 +33,9 @@ def is_decay(group: str) -> bool:
     return group.startswith("decay")
 
 
-def shifted_products(x: Array, y: Array, *, least: int) -> tuple[Array, Array, Array, Array]:
+def shifted_products(
+    x: Array, y: Array, *, least: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Array]:
     """Return the sums of products of two signals at every shift, by the convolution theorem.
 
     Parameters
