@@ -154,17 +154,28 @@ class RequestRefused(ConfigError):
 # ---------------------------------------------------------------------- points by hand
 
 
+def check_version(entry: Entry, criterion: str, version: str) -> None:
+    """Refuse a change that is based on another version of a criterion's points.
+
+    Raises
+    ------
+    Conflict : somebody else changed the points, or the submission was graded again.
+    """
+    if version != entry.version(criterion):
+        raise Conflict(
+            f"{criterion}: was changed or graded again after this page was shown",
+            now=entry.given.get(criterion),
+        )
+
+
 def give(entry: Entry, wanted: WantedPoints) -> Event:
     """Give points or a comment, or change the total.
 
     Raises
     ------
     ConfigError : the criterion does not exist, the points are out of range, or a reason is missing.
-    Conflict : the points have changed since the version that the person saw.
     """
     criterion, points, text = wanted.criterion, wanted.points, wanted.why.strip()
-    if wanted.version:
-        _check_version(entry, criterion, wanted.version)
     if not text:
         raise ConfigError("a change of points needs a reason (--why) and a name (--by)")
     if criterion == TOTAL:
@@ -211,16 +222,13 @@ def beside(entry: Entry, wanted: WantedPoints) -> WantedPoints:
     return replace(wanted, points=given.points, comment=False)
 
 
-def undo(entry: Entry, criterion: str, *, version: str = "") -> Event:
+def undo(entry: Entry, criterion: str) -> Event:
     """Undo the last change of a criterion; a second call redoes it.
 
     Raises
     ------
     ConfigError : nothing was changed by hand.
-    Conflict : the points have changed since `version`.
     """
-    if version:
-        _check_version(entry, criterion, version)
     changes = entry.changes(criterion)
     if not changes:
         raise ConfigError(f"{criterion}: nothing was changed by hand")
@@ -349,14 +357,6 @@ def reopen(entry: Entry, criterion: str, *, version: str) -> Event:
     if _current_request(entry, criterion, version).state != "answered":
         raise RequestRefused("only an answered request can be reopened")
     return Event(what="reopened", criterion=criterion)
-
-
-def _check_version(entry: Entry, criterion: str, version: str) -> None:
-    if version != entry.version(criterion):
-        raise Conflict(
-            f"{criterion}: was changed or graded again after this page was shown",
-            now=entry.given.get(criterion),
-        )
 
 
 def _current_request(entry: Entry, criterion: str, version: str) -> Request:

@@ -449,11 +449,13 @@ class Gradebook:
         ------
         Conflict : somebody else changed the points, or the submission was graded again.
         """
-        wanted = WantedPoints(
-            submission=team, criterion=criterion, points=points, why=why, version=version
-        )
+        wanted = WantedPoints(submission=team, criterion=criterion, points=points, why=why)
 
-        return self._decide(team, lambda entry: [decisions.change(entry, wanted)], by=by)[0]
+        def decide(entry: Entry) -> list[Event]:
+            decisions.check_version(entry, criterion, version)
+            return [decisions.change(entry, wanted)]
+
+        return self._decide(team, decide, by=by)[0]
 
     def undo(self, team: str, criterion: str, *, by: str, version: str) -> Event:
         """Undo the last change of a criterion; a second call redoes it.
@@ -462,9 +464,12 @@ class Gradebook:
         ------
         Conflict : see `change`.
         """
-        return self._decide(
-            team, lambda entry: [decisions.undo(entry, criterion, version=version)], by=by
-        )[0]
+
+        def decide(entry: Entry) -> list[Event]:
+            decisions.check_version(entry, criterion, version)
+            return [decisions.undo(entry, criterion)]
+
+        return self._decide(team, decide, by=by)[0]
 
     def change_all(self, wishes: Sequence[WantedPoints], *, by: str) -> BulkChange:
         """Give points by hand to several submissions; if one change is refused, all are.
@@ -482,14 +487,14 @@ class Gradebook:
                 if wish.submission not in known:
                     raise ConfigError(f"{where}no such submission is in the class")
                 row, entry = known[wish.submission]
+                if wish.version:
+                    decisions.check_version(entry, wish.criterion, wish.version)
                 try:
                     event = decisions.give(entry, decisions.beside(entry, wish))
                     if decisions.is_repeated(entry, event):
                         continue
                     stored = self._store(connection, row, [event], by=by, at=at)
                 except ConfigError as error:
-                    if not where:
-                        raise
                     raise ConfigError(f"{where}{error}") from None
                 known[wish.submission] = row, entry.after(*stored)
                 new += 1
