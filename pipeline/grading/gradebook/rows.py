@@ -183,15 +183,20 @@ def read_entries(
     numbers = {row.submission_id for row, _ in lines}
     done = read_events(connection, events.c.submission_id.in_(numbers))
     keys = first_keys(connection, numbers)
+    grades = [read_grade(row.grade) for row, _ in lines]
     return [
-        read_entry(
-            row,
-            done.get(row.submission_id, ()),
-            shared=shared,
+        Entry(
+            submission=row.name,
             rubric=rubric,
+            graded=grade.with_flags(shared) if shared else grade,
+            authors=row.authors,
+            events=tuple(done.get(row.submission_id, ())),
+            owner=row.owner,
+            key=row.key,
+            grading=row.id,
             first_key=keys.get(row.submission_id, ""),
         )
-        for row, shared in lines
+        for (row, shared), grade in zip(lines, grades, strict=True)
     ]
 
 
@@ -225,9 +230,8 @@ class ClassNow:
 
 def read_class(connection: sa.Connection, batch: sa.Row, before: ClassNow | None) -> ClassNow:
     """Return a class list with current grades, with the unchanged entries of an earlier result."""
-    rubric, members = read_rubric(batch), in_class(batch)
-    done = read_events(connection, events.c.submission_id.in_(members))
-    keys = first_keys(connection, members)
+    rubric, lines = read_rubric(batch), class_list(batch)
+    done = read_events(connection, events.c.submission_id.in_(in_class(batch)))
     known = before.made_of if before and before.rubric == rubric else {}
     columns = gradings.c.id, gradings.c.at, gradings.c.submission_id
     made_of = {
@@ -237,42 +241,11 @@ def read_class(connection: sa.Connection, batch: sa.Row, before: ClassNow | None
         for row in connection.execute(class_list(batch, *columns))
     }  # fmt: skip
     listed = {at: known[of] for at, of in made_of.items() if of in known}
-    rows = class_list(batch)
-    if listed:
-        rows = rows.where(entries.c.position.in_([at for at in made_of if at not in listed]))
-    for row in connection.execute(rows):
-        number = row.submission_id
-        listed[row.position] = read_entry(
-            row,
-            done.get(number, ()),
-            shared=read_flag(row.shared),
-            rubric=rubric,
-            first_key=keys[number],
-        )
+    for page in pages([at for at in made_of if at not in listed]):
+        chosen = lines.where(entries.c.position.in_(page))
+        found = read_lines(connection, chosen, rubric=rubric)
+        listed |= {row.position: entry for row, entry in found}
     return ClassNow(rubric=rubric, made_of={of: listed[at] for at, of in made_of.items()})
-
-
-def read_entry(
-    row: sa.Row,
-    done: Sequence[Event],
-    *,
-    shared: Flag | None,
-    rubric: Rubric,
-    first_key: str = "",
-) -> Entry:
-    """Return a line of the class list as it stands after the events `done`."""
-    grade = read_grade(row.grade)
-    return Entry(
-        submission=row.name,
-        rubric=rubric,
-        graded=grade.with_flags(shared) if shared else grade,
-        authors=row.authors,
-        events=tuple(done),
-        owner=row.owner,
-        key=row.key,
-        grading=row.id,
-        first_key=first_key,
-    )
 
 
 def read_events(connection: sa.Connection, *where: sa.ColumnElement) -> dict[int, list[Event]]:
