@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.grading.grade import CODES, Flag, Grade, grade_text
+from pipeline.grading.grade import Grade, grade_text
 from pipeline.grading.judge.checks import between
 from pipeline.grading.judge.run import grade_submission, under_rubric, with_all_springs
 from pipeline.grading.mistakes.state_model import StateMatrices, compare_entries
@@ -315,15 +315,6 @@ def test_a_loop_without_a_model_is_not_judged(lacking):
     graded = replace(one, analysis=replace(one.analysis, fit=fit, hardware=())).grade()
     loop = criterion(graded, "hardware")
     assert (loop.outcome, loop.points) == ("skip" if lacking == "carts" else "fail", 0)
-
-
-def test_further_flags_keep_the_order_of_the_codes():
-    """Flags that a batch adds are sorted in the order of the codes."""
-    graded = student(2).without("final", "zeta_b").grade()
-    flag = Flag(code="shared_data", parameters=("step-1",), message="…", evidence={})
-    data = Flag(code="data_problem", parameters=("step-1",), message="…", evidence={})
-    codes = [f.code for f in graded.with_flags(data, flag).flags]
-    assert codes == sorted(codes, key=CODES.index) == ["missing", "shared_data", "data_problem"]
 
 
 @pytest.mark.parametrize(("hide", "loosely"), [((), False), (("dead_zone",), True)])
