@@ -419,7 +419,6 @@ _ABOUT: Mapping[Code, str] = {
     "missing": "required",
     "data_problem": "data",
 }
-_REDUCED = "data"  # the check that a flag concerns if its evidence names no parameter table
 
 
 def concerns(flag: Flag, criterion: Criterion, *, names: list[str]) -> bool:
@@ -430,7 +429,7 @@ def concerns(flag: Flag, criterion: Criterion, *, names: list[str]) -> bool:
         return _ABOUT[flag.code] == criterion.check
     tables = {flag.evidence.get("table"), flag.evidence.get("also_in")} - {None}
     if not tables:
-        return criterion.check == _REDUCED
+        return criterion.check == "data"  # a table that the students reduced themselves
     if not isinstance(criterion, Parameters) or criterion.check not in tables:
         return False
     return not set(flag.parameters).isdisjoint(matching(criterion.parameters, names))

@@ -30,7 +30,6 @@ from pipeline.submission.toml import (
     without_tag,
 )
 
-_MAX_BYTES = 1_000_000
 _CHECKS: tuple[str, ...] = tuple(
     check
     for model in get_args(get_args(asked.Criterion)[0])
@@ -74,7 +73,7 @@ def shipped_rubric(carts: int) -> Rubric | None:
 
 def rubric_source(path: Path) -> str:
     """Return the text of a rubric."""
-    return read_text(path, where=path.name, limit=_MAX_BYTES, error=ConfigError)
+    return read_text(path, where=path.name, limit=1_000_000, error=ConfigError)
 
 
 class InvalidRubric(ConfigError):

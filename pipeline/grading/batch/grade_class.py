@@ -35,7 +35,6 @@ from pipeline.words.numbers import count, listing
 
 _SCRATCH = re.compile(r"\.scratch(-\d+)?")
 _PATIENCE = 60.0  # s to wait for the gradebook's server; a restart takes a few
-_NAMED = 8  # most submissions named in one message
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,7 +345,7 @@ def _lateness_messages(
 
 
 def _names(names: Sequence[str]) -> str:
-    return listing(names, most=_NAMED)
+    return listing(names, most=8)
 
 
 def _listed_names(book_of: Callable[[], Gradebook]) -> list[str]:

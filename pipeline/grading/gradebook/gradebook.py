@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 State = tuple[int, int, int]
 
-_SUGGESTED = 4  # names of submissions in one suggestion
 _MOST_SHOWN = 50  # requests of each kind on one page
 _OPEN_CASE = "recordings or numbers are shared with another team; nobody has reviewed this yet"
 
@@ -917,7 +916,7 @@ class Gradebook:
 def _similar(team: str, names: Sequence[str]) -> str:
     """Return "; did you mean …?" with all names that end with the typed one, or the nearest."""
     ends = [repr(name) for name in names if person(name).endswith(person(team))]
-    return f"; did you mean {' or '.join(ends[:_SUGGESTED])}?" if ends else nearest(team, names)
+    return f"; did you mean {' or '.join(ends[:4])}?" if ends else nearest(team, names)
 
 
 def _named(team: str, listed: Sequence[Row]) -> list[Row]:

@@ -28,7 +28,6 @@ from pipeline.grading.words import on_one_line, points_text
 from pipeline.submission.load import NAME
 
 _FAILED = "could not be graded: "  # precedes the reason in the text of an event
-_TOLD = (*POINTS, *REQUESTS, *HOLDS)
 _SHOWN = ("at", "what", "points", "out_of", "criterion", "text", "by")
 
 
@@ -44,9 +43,10 @@ def read_history(
     """
     named = not shown_as
     done = read_events(connection, events.c.submission_id == submission).get(submission, ())
+    told = (*POINTS, *REQUESTS, *HOLDS)
     found = [
         *_graded(connection, submission),
-        *(_shown(event, named=named) for event in done if event.what in _TOLD),
+        *(_shown(event, named=named) for event in done if event.what in told),
         *_listed(connection, submission, named=named),
         *_passed(connection, submission, [event for event in done if event.what in POINTS]),
     ]

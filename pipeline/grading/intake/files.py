@@ -28,7 +28,6 @@ from pipeline.submission.toml import quote
 from pipeline.words.numbers import first_few
 
 _DEEPEST = 12  # levels of folders that are searched in a hand-in
-_ARCHIVES_IN_ARCHIVES = 3
 _FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # so that the same files give the same archive
 
 
@@ -108,7 +107,7 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
             f"more than {HAND_IN.members:,} files; submit {NAME}, notes.md and the files they name"
         )
     left = HAND_IN
-    for _ in range(_ARCHIVES_IN_ARCHIVES):
+    for _ in range(3):  # archives in archives
         if _submissions(into):
             break
         for path in [path for path in _below(into) if path.suffix.lower() == ".zip"]:

@@ -37,7 +37,6 @@ _DAYS_OF_A_LATE_MARK = 1.0  # Canvas marks a late file without saying how late; 
 _LONGEST_ID, _MOST_BYTES = 100, 200  # characters and bytes that every system allows in a name
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f\x7f-\x9f]')
 _RESULTS = ("class.html", "feedback/.made.json")  # these mark the output folder of a grading
-_PARTS_OF_RESULTS = ("feedback", "gradescope")
 _DATA = "data"  # folder of recordings; its name is never the id of a hand-in
 
 
@@ -245,7 +244,7 @@ def _is_skipped(entry: Path, *, walk: _Walk) -> bool:
         return False
     if entry.name.startswith("."):
         return True
-    results = entry.parent if entry.name in _PARTS_OF_RESULTS else entry
+    results = entry.parent if entry.name in ("feedback", "gradescope") else entry
     if not all(os.access(results / name, os.F_OK) for name in _RESULTS):
         return False
     if results not in walk.skip:  # report it, because a student's own folder may look like results

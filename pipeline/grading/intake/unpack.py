@@ -20,7 +20,6 @@ from pipeline.errors import SubmissionError, is_name_fault
 from pipeline.output import DEVICE
 from pipeline.submission.toml import quote
 
-_CHUNK = 1 << 16
 _RATIO_FROM = 1_000_000  # bytes; the ratio of smaller files is not limited
 # The end record of a zip file and its comment are within this number of bytes from the end.
 _END_OF_ZIP = 66_000
@@ -38,8 +37,6 @@ _MEMBER = re.compile(rb"PK\x03\x04.{22}(..)..", re.DOTALL)
 # On Windows a colon starts a stream, and a final dot is dropped.
 _NOT_ON_WINDOWS = re.compile(r'[<>:"|?*\x00-\x1f]|[. ]$')
 
-_DEBRIS_FOLDERS = ("__MACOSX",)
-_DEBRIS_FILES = (".ds_store", "thumbs.db", "desktop.ini")
 # Archives that cartlab cannot open; the message asks for a zip file instead.
 STRANGE_ARCHIVES = (".7z", ".bz2", ".gz", ".rar", ".tar", ".tbz", ".tgz", ".xz", ".zst")
 
@@ -86,8 +83,8 @@ def is_debris(path: PurePosixPath) -> bool:
     """Return whether a file is one that macOS or Windows creates by itself."""
     name = path.name.lower()
     return (
-        any(part in _DEBRIS_FOLDERS for part in path.parts)
-        or name in _DEBRIS_FILES
+        "__MACOSX" in path.parts
+        or name in (".ds_store", "thumbs.db", "desktop.ini")
         or name.startswith(("._", "~$"))
     )
 
@@ -330,7 +327,7 @@ def _copy(
 ) -> None:
     """Unpack one file and count its bytes, because the size in its header may be false."""
     size = 0
-    while chunk := packed.read(_CHUNK):
+    while chunk := packed.read(1 << 16):
         size += len(chunk)
         budget.total -= len(chunk)
         if budget.total < 0:

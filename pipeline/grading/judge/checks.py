@@ -385,7 +385,6 @@ _JUDGES: Mapping[str, Callable[[Any, GradingContext], Verdict]] = {
 
 _MOST_WIDENING = 4  # tolerances; a law that needs this much widening earns no points
 _PER_TOLERANCE = 2  # steps of widening per tolerance
-_REDUNDANT = (2, 3)  # numbers of carts whose parameters are redundant
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -461,7 +460,7 @@ def _evaluate(
             f"{lesser} = {value[lesser]:.4g} is above {greater} = {value[greater]:.4g} ({reason})"
         )
         results[f"order.{lesser}.{greater}"] = (said, holds)
-    if n not in _REDUNDANT:
+    if n not in (2, 3):  # no other number of carts has redundant parameters
         return results
     with np.errstate(all="ignore"):
         found = recover_from_parameters(_corners(value, half, n=n))

@@ -59,7 +59,6 @@ _OF_TABLES: Mapping[str, tuple[Label, ...]] = {
     "initial_final": ("initial", "final"),
     "laws": ("final",),
 }
-_OF_LOOP = ("gains", "claims", "prefilter")
 _GAINS = Slip(code="wrong_gains")
 
 
@@ -104,7 +103,7 @@ class GradingContext:
 
     def slips(self, check: str) -> list[Slip]:
         """Return the mistakes that may cost points in a check and can be undone."""
-        if check in _OF_LOOP:
+        if check in ("gains", "claims", "prefilter"):
             return [_GAINS] if self.meant is not None else []
         labels = _OF_TABLES.get(check, ())
         return list(all_slips([one for label in labels for one in self.slipped[label]]))

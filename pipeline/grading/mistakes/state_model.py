@@ -25,8 +25,6 @@ from pipeline.submission import ReportedStateSpace
 EntryKind = Literal["exact", "stiffness", "damping"]
 
 _NAMED = 3  # largest number of carts whose named parameters determine the chain
-_MODES = ("omega_a", "omega_b", "omega_c")
-_NULLS = ("omega_x", "omega_y")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -261,7 +259,8 @@ def _by_own_frequencies(values: Mapping[str, float], n: int) -> Array | None:
     if n not in (2, 3) or not {*parameter_names(n)} <= values.keys():
         return None
     last = [f"omega_{n}"]
-    groups = [["omega_a", "omega_b"], last] if n == 2 else [[*_MODES], [*_NULLS], last]
+    modes = ["omega_a", "omega_b", "omega_c"]
+    groups = [modes[:2], last] if n == 2 else [modes, ["omega_x", "omega_y"], last]
     T = [*(np.prod([values[name] ** 2 for name in group]) for group in groups), 1.0]
     model = np.nan_to_num(_direct(values, n))
     model[0::2, 1:-1:2] = np.eye(n)

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-_ALL = sys.maxsize  # names
-
-
 @dataclass(frozen=True, kw_only=True)
 class Student:
     """One student's grade.
@@ -140,7 +137,7 @@ def students_of(
 
 
 def about(
-    what: str, names: Iterable[str], *, most: int = _ALL, left_out: bool = False
+    what: str, names: Iterable[str], *, most: int = sys.maxsize, left_out: bool = False
 ) -> list[Remark]:
     """Return a remark that names some people or submissions, each once; none without names.
 

@@ -130,7 +130,6 @@ def find_basis(submission: Submission) -> str:
 
 
 WORDS = phrases("check")
-_NAMED = 4  # largest number of recordings named one by one; of more, only the first and last
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +193,7 @@ def _stretch_text(stretch: RecordingPart) -> str:
 
 
 def _runs_text(runs: Sequence[str]) -> str:
-    return ", ".join(runs) if len(runs) <= _NAMED else f"{runs[0]} … {runs[-1]}"
+    return ", ".join(runs) if len(runs) <= 4 else f"{runs[0]} … {runs[-1]}"
 
 
 def answer_lines(answer: CheckAnswer) -> Iterator[str]:

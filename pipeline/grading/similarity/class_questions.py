@@ -22,8 +22,6 @@ from pipeline.words.text import clean
 
 # ----------------------------------------------------------------- repeated authors
 
-_MOST_SUBMISSIONS = 8  # submissions named for one person
-
 
 @dataclass(frozen=True, kw_only=True)
 class RepeatedAuthors:
@@ -49,7 +47,7 @@ class RepeatedAuthors:
         nameless = f"{len(named)} people" if several else "One person"
         who = listing(named) if all(named) else nameless
         are = "are" if several else "is"
-        where = listing([clean(name) for name in self.submissions], most=_MOST_SUBMISSIONS)
+        where = listing([clean(name) for name in self.submissions], most=8)
         if not (self.recordings or self.compared):
             return f"{who} {are} in {where}; their recordings could not be compared"
         common = count(self.recordings, "recording") if self.recordings else "no recording"

@@ -14,6 +14,7 @@ from decimal import Decimal
 
 import numpy as np
 
+from pipeline.estimation.noise import MEDIAN_TO_SIGMA
 from pipeline.grading.grade import Grade
 from pipeline.grading.gradings import Grading
 from pipeline.grading.rubric import Rubric
@@ -29,7 +30,6 @@ _MOST_DECADES = 2.0  # that one number counts, so that a few numbers do not deci
 _LEAST_DECADES = 8.0
 _GROSS = 4.0  # standard deviations; two teams that are both further off may have the same slip
 _EQUAL_DATA = 1e-6  # relative difference of numbers that were computed from equal recordings
-_TO_SIGMA = 1.4826  # from the median of absolute deviations, for a normal distribution
 _GIVEN_PART = 1 / 2  # share of a class; a number that more teams report was given to them
 
 Key = tuple[str, str]  # table (initial or final) and name of a number
@@ -180,7 +180,7 @@ def _spreads(numbers: Sequence[Mapping[Key, TypedNumber]]) -> dict[Key, tuple[fl
     found = {}
     for kind, those in errors.items():
         middle = float(np.median(those))
-        found[kind] = middle, float(_TO_SIGMA * np.median(np.abs(np.array(those) - middle)))
+        found[kind] = middle, float(MEDIAN_TO_SIGMA * np.median(np.abs(np.array(those) - middle)))
     return found
 
 
