@@ -317,7 +317,8 @@ def _final(
         if row.initial and (measured or not is_explained(analysis)):
             spread = limits.READ_BY_EYE if row.initial.source == "frequency_response" else 1.0
             measured += [row.initial.value / spread, row.initial.value * spread]
-    told = fitted is not None and not (read_name(row.name).is_damping and _undamped(analysis))
+    undamped = analysis.chain is not None and not np.all(analysis.chain.c > 0)
+    told = fitted is not None and not (read_name(row.name).is_damping and undamped)
     # Readings may disagree with the fit because of a wrong unit, sign or clock, and are then left
     # out. Dampings stay, because they depend on none of these. Dry friction adds to dampings, more
     # in dwells than in decays, and a fit to few dwells looks good in spite of it.
@@ -345,11 +346,6 @@ def _agrees(value: float, fitted: Estimate) -> bool:
     slack, factor = limits.SIGMAS * (fitted.std or 0.0), 1 + GAIN_AND_FREQUENCY_LIMIT / 100
     least, most = fitted.value / factor, fitted.value * factor
     return least - slack <= value <= most + slack
-
-
-def _undamped(analysis: Analysis) -> bool:
-    """Return whether the fit stopped at zero damping and so measured no damping."""
-    return analysis.chain is not None and not np.all(analysis.chain.c > 0)
 
 
 def _by_decays(chain: Chain, analysis: Analysis) -> list[dict[str, float]]:

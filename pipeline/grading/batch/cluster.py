@@ -118,12 +118,6 @@ def _grade_on_worker(hand_in: HandIn, archive: bytes, plugin: str) -> Grading:
     return graders.grade(hand_in, archive)
 
 
-def _threads(client: Client) -> int:
-    """Return how many tasks the cluster can run at once; this changes as workers come and go."""
-    workers = client.scheduler_info(n_workers=-1)["workers"]
-    return sum(worker["nthreads"] for worker in workers.values())
-
-
 def _grade_all(
     client: Client, hand_ins: Sequence[HandIn], *, graders: str, out_of: float
 ) -> Iterator[Grading]:
@@ -135,7 +129,8 @@ def _grade_all(
     under_way: dict[str, HandIn] = {}
     answers = as_completed(loop=client.loop)
     while waiting or under_way:
-        room = max(1, _AHEAD * _threads(client))
+        workers = client.scheduler_info(n_workers=-1)["workers"]  # they come and go
+        room = max(1, _AHEAD * sum(worker["nthreads"] for worker in workers.values()))
         while waiting and len(under_way) < room:
             hand_in = waiting.pop()
             try:

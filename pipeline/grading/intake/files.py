@@ -18,7 +18,6 @@ from pipeline.errors import SubmissionError
 from pipeline.grading.intake.unpack import (
     HAND_IN,
     STRANGE_ARCHIVES,
-    UnpackLimits,
     is_debris,
     unpack,
 )
@@ -118,7 +117,9 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
             if refused:
                 raise SubmissionError(f"{quote(path.name)}: {next(iter(refused.values()))}")
             path.unlink()
-            left = _remaining_limits(left, folder)
+            sizes = [path.stat().st_size for path in _below(folder)]
+            members, total = left.members - 1 - len(sizes), left.total - sum(sizes)
+            left = replace(left, members=members, total=total)
     if tomls := _submissions(into):
         folder = _only_submission(tomls, into)
         _gather_loose(folder)
@@ -166,12 +167,6 @@ def _walk(folder: Path, below: PurePosixPath) -> Iterator[tuple[int, str, Path]]
                 yield from _walk(Path(entry.path), name)
             elif entry.is_file(follow_symlinks=False):
                 yield entry.stat(follow_symlinks=False).st_size, str(name), Path(entry.path)
-
-
-def _remaining_limits(limits: UnpackLimits, folder: Path) -> UnpackLimits:
-    """Return the limits that remain after the files in a folder have been unpacked."""
-    sizes = [path.stat().st_size for path in _below(folder)]
-    return replace(limits, members=limits.members - 1 - len(sizes), total=limits.total - sum(sizes))
 
 
 def _below(folder: Path) -> list[Path]:

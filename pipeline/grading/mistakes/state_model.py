@@ -135,8 +135,8 @@ def compare_entries(
     """
     places = (*order, 2 * n)
     kinds, entries = _kinds(n), []
-    for typed_at, number in _matrix(space, n).items():
-        i, j = places[typed_at[0]], places[typed_at[1]]
+    for (row, column), number in _matrix(space, n).items():
+        i, j = places[row], places[column]
         known = [
             (float(model.right[i, j]), float(model.slack[i, j]))
             for model in models
@@ -147,7 +147,7 @@ def compare_entries(
         kind = kinds[i][j]
         entries.append(
             MatrixEntry(
-                name=_entry_name(*typed_at, n=n),
+                name=f"A({row + 1}, {column + 1})" if column < 2 * n else f"B({row + 1})",
                 at=(i, j),
                 kind=kind,
                 typed=number,
@@ -348,10 +348,6 @@ def _kinds(n: int) -> list[list[EntryKind]]:
         kinds[2 * i + 1][2 * i + 1] = "damping"
     kinds[1][2 * n] = "stiffness"
     return kinds
-
-
-def _entry_name(i: int, j: int, *, n: int) -> str:
-    return f"A({i + 1}, {j + 1})" if j < 2 * n else f"B({i + 1})"
 
 
 def _matrix(space: ReportedStateSpace, n: int) -> dict[tuple[int, int], Decimal]:

@@ -319,7 +319,9 @@ def _judge(
             mistakes += transient_fits(analysis, table, known)
     # If gains are in an impossible order, this is reported rather than a guess at the mistake.
     if any(law.is_of_gains for law in laws):
-        mistakes = [m for m in mistakes if m.is_plain or not _is_of_gains(m)]
+        mistakes = [
+            m for m in mistakes if m.is_plain or not all(read_name(n).is_gain for n in m.predicted)
+        ]
     return _Judged(
         label=label,
         table=table,
@@ -353,10 +355,6 @@ def _agrees(final: Decimal, references: References, name: str) -> bool:
     """Return whether a final number agrees with the recordings."""
     known = references.final.get(name)
     return known is not None and percent_off(final, known, sigmas=limits.SIGMAS) == 0
-
-
-def _is_of_gains(mistake: Mistake) -> bool:
-    return all(read_name(name).is_gain for name in mistake.predicted)
 
 
 def _near(a: Decimal, b: Decimal) -> bool:

@@ -322,7 +322,10 @@ class Roster:
         }
         remarks = self._name_rows(f"replaced in {self.file}", replaced)
         remarks += self._remarks(students, matched, found, settled)
-        remarks += self._kept(table[points].drop(index=graded))
+        of_all = set(table.index[self._of_all()])
+        own = table[points].drop(index=graded).items()
+        kept = {at: text for at, text in own if text.strip() and at not in of_all}
+        remarks += self._name_rows(f"no grade from cartlab, so {self.file} keeps its own", kept)
         return csv_text([*table.columns], table.itertuples(index=False)), remarks
 
     def _remarks(
@@ -369,17 +372,6 @@ class Roster:
             "matched by the number in the file name, and therefore taken to be one of the authors",
             (f"{s.name} ({s.grade.submission})" for s in by_number),
         )
-
-    def _kept(self, grades: "pd.Series") -> list[Remark]:
-        """Return a remark on grades that only the table has.
-
-        Parameters
-        ----------
-        grades : the column of grades, without the rows that cartlab filled in.
-        """
-        of_all = set(self.table.index[self._of_all()])
-        kept = {at: text for at, text in grades.items() if text.strip() and at not in of_all}
-        return self._name_rows(f"no grade from cartlab, so {self.file} keeps its own", kept)
 
     def _name_rows(self, what: str, grades: Mapping[Any, str]) -> list[Remark]:
         """Return a remark on grades in the table, with the names in their rows."""

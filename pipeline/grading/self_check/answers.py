@@ -6,7 +6,7 @@ counts every request, one line each, and is part of the submission. The sentence
 """
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -189,11 +189,9 @@ def _stretch_text(stretch: RecordingPart) -> str:
     if len(stretch.recordings) == 1:
         return WORDS.text("stretch_one", runs=stretch.recordings[0], part=part)
     kind = WORDS.text(f"kind_{stretch.kind}")
-    return WORDS.text("stretch_every", kind=kind, runs=_runs_text(stretch.recordings), part=part)
-
-
-def _runs_text(runs: Sequence[str]) -> str:
-    return ", ".join(runs) if len(runs) <= 4 else f"{runs[0]} … {runs[-1]}"
+    runs = stretch.recordings
+    named = ", ".join(runs) if len(runs) <= 4 else f"{runs[0]} … {runs[-1]}"
+    return WORDS.text("stretch_every", kind=kind, runs=named, part=part)
 
 
 def answer_lines(answer: CheckAnswer) -> Iterator[str]:
