@@ -160,6 +160,8 @@ Grades = Annotated[
 Team = Annotated[
     str, typer.Argument(metavar="TEAM", help="A submission, one of its authors, or anon-….")
 ]
+By = Annotated[str, typer.Option(metavar="NAME", help="Who decides.")]
+Why = Annotated[str, typer.Option(help="The reason, which the student reads.")]
 Lab = Annotated[
     str | None,
     typer.Option("--assignment", help="Name of the rubric, if the gradebook has several."),
@@ -169,7 +171,7 @@ Lab = Annotated[
 @app.command(context_settings={"ignore_unknown_options": True})  # -1 is a number, not an option
 def override(
     grades: Grades,
-    by: Annotated[str, typer.Option(metavar="NAME", help="Who decides.")],
+    by: By,
     team: Annotated[
         str, typer.Argument(metavar="[TEAM]", help="A submission, one of its authors, or anon-….")
     ] = "",
@@ -179,7 +181,7 @@ def override(
     points: Annotated[
         str, typer.Argument(metavar="[POINTS]", help="A number, or auto for the automatic points.")
     ] = "",
-    why: Annotated[str, typer.Option(help="The reason, which the student reads.")] = "",
+    why: Why = "",
     table: Annotated[
         Path | None,
         typer.Option(
@@ -208,8 +210,8 @@ def adjust(
     points: Annotated[
         str, typer.Argument(metavar="POINTS", help="Points to add, such as 1.5; -2 deducts two.")
     ],
-    why: Annotated[str, typer.Option(help="The reason, which the student reads.")],
-    by: Annotated[str, typer.Option(metavar="NAME", help="Who decides.")],
+    why: Why,
+    by: By,
     assignment: Lab = None,
 ) -> None:
     """Change a team's total, for a bonus or a penalty; every later grading keeps it."""
@@ -222,7 +224,7 @@ def adjust(
 @app.command()
 def hold(
     grades: Grades,
-    by: Annotated[str, typer.Option(metavar="NAME", help="Who decides.")],
+    by: By,
     team: Annotated[
         str, typer.Argument(metavar="[TEAM]", help="A submission, or one of its authors.")
     ] = "",

@@ -153,16 +153,16 @@ class Batch:
     keys : keys of the gradings, in the order of the submission ids.
     shared : flag for recordings or tables that another submission also contains, by submission.
     failed : name and reason for each submission that could not be graded.
-    unsettled : failed submissions that the next run grades again.
-    disk_full : submissions that failed because the disk was full.
+    unsettled : number of failed submissions that the next run grades again.
+    disk_full : number of submissions that failed because the disk was full.
     kept, moved, taken_over : changes to the class list; see `batch.runner.ClassChanges`.
     """
 
     keys: tuple[str, ...]
     shared: Mapping[str, Flag]
     failed: tuple[tuple[str, str], ...] = ()
-    unsettled: frozenset[str] = frozenset()
-    disk_full: frozenset[str] = frozenset()
+    unsettled: int = 0
+    disk_full: int = 0
     kept: tuple[str, ...] = ()
     moved: Mapping[str, str] = field(default_factory=dict)
     taken_over: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = ()

@@ -205,8 +205,8 @@ def grade_class(
         total=total,
         failed=tuple(sorted(failed)),  # sorted, so that their order does not reveal hidden names
         sharing=len(batch.shared),
-        unsettled=len(batch.unsettled),
-        disk_full=len(batch.disk_full),
+        unsettled=batch.unsettled,
+        disk_full=batch.disk_full,
         remarks=(*remarks, *(f"{people}: see class.html" for people in repeated)),
         changes=tuple(changes),
     )

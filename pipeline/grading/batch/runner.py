@@ -68,18 +68,15 @@ def grade_batch(
         submission or step.
     """
     rows, new = _known_and_new(hand_ins, setup=setup, book=book)
-    unsettled, no_room = set[str](), set[str]()
-    total = len(hand_ins)
+    unsettled, no_room, total = 0, 0, len(hand_ins)
     progress(len(rows), total, "")
     for outcome in execute(new, setup) if new else ():
         book.put(outcome)
         rows[outcome.submission] = outcome.without_texts()
         if setup.out and (outcome.original or (setup.out / FOLDER).is_dir()):
             keep_original(setup.out, outcome.submission, outcome.original)
-        if outcome.status == "failed" and not outcome.settled:
-            unsettled.add(outcome.submission)
-        if outcome.is_disk_full:
-            no_room.add(outcome.submission)
+        unsettled += outcome.status == "failed" and not outcome.settled
+        no_room += outcome.is_disk_full
         progress(len(rows), total, outcome.submission)
     progress(total, total, "comparing the recordings")
     before = find_class_changes(rows, book)
@@ -89,8 +86,8 @@ def grade_batch(
         keys=tuple(row.key for row in in_order),
         shared=_shared(in_order, book, rubric=setup.rubric, examples=examples),
         failed=tuple((row.submission, row.reason) for row in in_order if row.reason),
-        unsettled=frozenset(unsettled),
-        disk_full=frozenset(no_room),
+        unsettled=unsettled,
+        disk_full=no_room,
         kept=tuple(before.kept),
         moved=before.moved,
         taken_over=before.taken_over,
