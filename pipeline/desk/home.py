@@ -1,6 +1,5 @@
 """The first page: what a person can do, the state of what is open, and folders to choose from."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,45 +20,6 @@ from pipeline.submission.load import file_problem
 _MADE = 3  # exercises listed on the first page
 # The rooms for which a folder can be chosen.
 _ROOMS = ("student", "bench", "solution")
-
-
-@dataclass(frozen=True, kw_only=True)
-class OpenSubmission:
-    """A submission on the first page: its number, its files, and what is made of it.
-
-    Attributes
-    ----------
-    report : state of the report; see `last_report.find_state`.
-    doubt : what the report says against its numbers, or "".
-    """
-
-    n: int
-    name: str
-    folder: Path
-    files: int
-    report: str
-    doubt: str
-    is_recording: bool
-    has_plan: bool
-    has_solution: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class OpenClass:
-    """A class on the first page; all numbers are 0 if it cannot be read, or is not graded yet.
-
-    Attributes
-    ----------
-    is_running : whether a task is running in its folder.
-    teams, seen : number of its teams, and of those that were reviewed.
-    """
-
-    n: int
-    name: str
-    place: Place
-    is_running: bool
-    teams: int
-    seen: int
 
 
 def show_home(ask: PageRequest) -> Response:
@@ -146,8 +106,12 @@ def _list_made(ask: PageRequest) -> list[Job]:
     return seen[:_MADE]
 
 
-def _describe_submission(ask: PageRequest, n: int, folder: Path) -> OpenSubmission:
-    """Return the state of a submission: its files, report, recordings and solution."""
+def _describe_submission(ask: PageRequest, n: int, folder: Path) -> dict[str, Any]:
+    """Return the state of a submission: its files, report, recordings and solution.
+
+    `report` is the state of the report (see `last_report.find_state`), and `doubt` is what the
+    report says against its numbers.
+    """
     session, data = ask.desk.benches.of(folder), folder / "data"
     try:
         # A link is not followed, because it may lead to a whole disk.
@@ -156,31 +120,34 @@ def _describe_submission(ask: PageRequest, n: int, folder: Path) -> OpenSubmissi
         status = read_findings(folder)["status"]
     except OSError:  # the desk may not read it, or its disk is not connected
         files, report, status = 0, "unreadable", None
-    return OpenSubmission(
-        n=n,
-        name=name_place(folder),
-        folder=folder,
-        files=files,
-        report=report,
-        doubt="" if status is None or status.is_fine else status.words,
-        is_recording=session is not None and not session.ended.is_set(),
-        has_plan=file_problem(folder, PLAN) is None,
-        has_solution=file_problem(folder, "solution/solution.html") is None,
-    )
+    return {
+        "n": n,
+        "name": name_place(folder),
+        "folder": folder,
+        "files": files,
+        "report": report,
+        "doubt": "" if status is None or status.is_fine else status.words,
+        "is_recording": session is not None and not session.ended.is_set(),
+        "has_plan": file_problem(folder, PLAN) is None,
+        "has_solution": file_problem(folder, "solution/solution.html") is None,
+    }
 
 
-def _describe_class(ask: PageRequest, n: int, place: Place) -> OpenClass:
-    """Return the state of a class: whether work is running there, and how many were reviewed."""
+def _describe_class(ask: PageRequest, n: int, place: Place) -> dict[str, Any]:
+    """Return the state of a class: whether work is running there, and how many were reviewed.
+
+    A class that cannot be read, or is not graded yet, has no teams.
+    """
     try:
         teams = ask.desk.gradebooks.of(place).now.entries
     except (PipelineError, OSError):
         teams = ()
     job = ask.desk.jobs.of(place) if isinstance(place, Path) else None
-    return OpenClass(
-        n=n,
-        name=name_place(place),
-        place=place,
-        is_running=job is not None and not job.over,
-        teams=len(teams),
-        seen=sum(1 for team in teams if team.reviewed_by),
-    )
+    return {
+        "n": n,
+        "name": name_place(place),
+        "place": place,
+        "is_running": job is not None and not job.over,
+        "teams": len(teams),
+        "seen": sum(1 for team in teams if team.reviewed_by),
+    }

@@ -87,13 +87,15 @@ def plots_are_current(folder: Path) -> bool:
 def read_findings(folder: Path) -> dict[str, Any]:
     """Return what the last report assumed, asked and found wrong, if its file can be read."""
     read = _read_findings_file(folder)
+    status = read.get("status")
     try:
         return {
             "questions": _pick_texts(read["questions"], ("id", "section", "text")),
             "assumed": _pick_assumptions(read.get("assumed", [])),
             "contradicted": _pick_assumptions(read.get("contradicted", [])),
             "failed": [str(one) for one in read["failed"]],
-            "status": _pick_status(read.get("status")),
+            # An earlier version wrote no status.
+            "status": status and TypeAdapter(ReportStatus).validate_python(status),
             "changes": str(read["changes"]),
             "turned": {str(run): int(sign) for run, sign in read.get("turned", {}).items()},
         }
@@ -113,11 +115,6 @@ def write_findings(
     told = {**findings, "made_of": made_of}
     write_file(out / FINDINGS, json.dumps(told, ensure_ascii=False))
     return told
-
-
-def _pick_status(found: object) -> ReportStatus | None:
-    """Return the status of the report; None in a file of an earlier version."""
-    return None if found is None else TypeAdapter(ReportStatus).validate_python(found)
 
 
 def _pick_assumptions(found: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -149,7 +149,8 @@ class _Run:
 
 def effect_figure(term: EffectTerm, chain: Chain) -> Figure:
     """Return a figure of an effect's fingerprint, and of the run in which the effect shows best."""
-    cart = _cart(term, chain)
+    # The effect's own cart, the cart right of its spring, or cart 1.
+    cart = min(max(term.place, 1), chain.n)
     runs = _runs(term, chain, cart=cart)
     shown = max(runs, key=lambda run: _difference(run, cart))
     figure, (left, right) = panels(1.75, columns=2, share_x=False)
@@ -178,11 +179,6 @@ def _window(run: _Run, cart: int) -> slice:
     half = round(0.5 * _RATE)
     first = min(max(largest - half, 0), run.t.size - 2 * half)
     return slice(first, first + 2 * half)
-
-
-def _cart(term: EffectTerm, chain: Chain) -> int:
-    """Return the cart to show: the effect's own cart, the cart right of its spring, or cart 1."""
-    return min(max(term.place, 1), chain.n)
 
 
 def _difference(run: _Run, cart: int) -> float:

@@ -472,7 +472,11 @@ def augmented_hardware_blocks(page: Page, gap: Gap) -> list[Block]:
     added = added_name(gap)
     table = page.table(WORDS, "replay_table", rows, "lcdd", added=added, Added=capital(added))
     blocks: list[Block] = [paragraph(WORDS.spans("replay", added=added)), table]
-    ordered = sorted(filter(None, replays.values()), key=_largest_error, reverse=True)
+    ordered = sorted(
+        filter(None, replays.values()),
+        key=lambda run: max(replay.nrmse for replay in run),
+        reverse=True,
+    )
     drawn = [ordered[0], *ordered[1:][-1:]]  # the worst and the best
     worst = max(drawn[0], key=lambda replay: replay.nrmse)
     values = {
@@ -488,10 +492,6 @@ def augmented_hardware_blocks(page: Page, gap: Gap) -> list[Block]:
     }
     figure = _replay_figure(drawn, position_unit=page.position, added=added)
     return [*blocks, page.picture("hardware-effects", figure, WORDS, "replay_figure", **values)]
-
-
-def _largest_error(replays: Sequence[Replay]) -> float:
-    return max(replay.nrmse for replay in replays)
 
 
 def _replay_figure(runs: Sequence[Sequence[Replay]], *, position_unit: str, added: str) -> Figure:

@@ -225,21 +225,19 @@ def _errors(gap: Gap) -> str:
     least = max(gap.noise_floor, gap.repeatability or 0.0)
     if not gap.left or gap.final <= NOTHING * least:
         return errors
-    worst = gap.left[0]
+    worst, times = gap.left[0], "More remains"
+    if least:
+        times = f"The error is still {significant(gap.final / least, digits=2)} times that"
     return WORDS.text(
         "left",
         errors=errors,
-        times=_times_left(gap.final / least) if least else "More remains",
+        times=times,
         run=clean(worst.experiment),
         cart=worst.cart,
         start=f"{worst.start:.2f}",
         end=f"{worst.end:.2f}",
         what=phase(worst.what),
     )
-
-
-def _times_left(times: float) -> str:
-    return f"The error is still {significant(times, digits=2)} times that"
 
 
 def kept_together(effects: Sequence[FoundEffect]) -> list[tuple[FoundEffect, ...]]:

@@ -6,7 +6,7 @@ Some modules are imported late, because they load the estimators.
 import json
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -57,35 +57,6 @@ class Port:
     name: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlanView:
-    """What the page shows of the plan.
-
-    Attributes
-    ----------
-    sound : whether the submission and its plan can be read; `wrong` says why not.
-    rows : the recordings of the plan.
-    left : the time still needed; "" if nothing is left to record.
-    units : the units of input and position; None without a readable submission.
-    parameters : name and words of each parameter of the bench.
-    recorded : number of recordings in the submission.
-    """
-
-    sound: bool = False
-    wrong: str = ""
-    rows: Sequence[Mapping[str, Any]] = ()
-    left: str = ""
-    units: Mapping[str, str] | None = None
-    parameters: Sequence[tuple[str, str]] = ()
-    carts: int = 0
-    recorded: int = 0
-
-
-def show(ask: PageRequest) -> Response:
-    """Show the plan and the forms, or the current session."""
-    return _show_page(ask)
-
-
 def plan(ask: PageRequest) -> Response:
     """Start the task that makes a plan or adds recordings to it."""
     _note_plan(ask)
@@ -123,7 +94,7 @@ def add(ask: PageRequest) -> Response:
         before = plan_ids(folder)
         new = add_recording(folder, _read_recording(typed, load_submission(folder)))
     except PipelineError as error:
-        return _show_page(ask, status=422, typed=typed, refused=str(error))
+        return show(ask, status=422, typed=typed, refused=str(error))
     ask.desk.benches.planned[folder] = before
     return ask.back(ask.here, f"{new.id} is in the plan.")
 
@@ -140,12 +111,10 @@ def show_comparison(ask: PageRequest) -> Response:
             "weigh_recording", folder=str(folder), recording=wanted, goal=goal
         )
     except PipelineError as error:
-        return _show_page(ask, status=422, typed=typed, refused=str(error))
+        return show(ask, status=422, typed=typed, refused=str(error))
     goal = typed["goal"]
     words = f"the {read_name(goal).words}" if goal else with_symbols(found["words"])
-    return _show_page(
-        ask, typed=typed, weighed={**found, "words": words, "bars": _scale_bars(found)}
-    )
+    return show(ask, typed=typed, weighed={**found, "words": words, "bars": _scale_bars(found)})
 
 
 def show_diary(ask: PageRequest) -> Response:
@@ -167,7 +136,7 @@ async def stream(ask: PageRequest) -> Response:
     return _find_session(ask).stream()
 
 
-def _show_page(
+def show(
     ask: PageRequest,
     *,
     status: int = 200,
@@ -175,7 +144,7 @@ def _show_page(
     refused: str = "",
     weighed: Mapping[str, Any] | None = None,
 ) -> Response:
-    """Show the room.
+    """Show the plan and the forms, or the current session.
 
     Parameters
     ----------
@@ -341,8 +310,13 @@ def plan_ids(folder: Path) -> frozenset[str] | None:
 
 def read_plan(
     folder: Path, *, session: BenchSession | None, before: Collection[str] | None
-) -> PlanView:
-    """Return what the page shows of the plan: its rows, the time still needed, what is wrong.
+) -> dict[str, Any]:
+    """Return what the page shows of the plan.
+
+    `sound` says whether the submission and its plan can be read; `wrong` says why not. `rows` are
+    the recordings of the plan, and `left` the time still needed, "" if nothing is left to record.
+    `units` are those of input and position, None without a readable submission. `parameters` have
+    the name and the words of each parameter, and `recorded` is the number of recordings.
 
     Parameters
     ----------
@@ -350,29 +324,32 @@ def read_plan(
     before : ids of the recordings that the plan had before the latest addition; None if no
         recording is new.
     """
+    found: dict[str, Any] = {
+        "sound": False, "wrong": "", "rows": (), "left": "", "units": None, "parameters": (),
+        "carts": 0, "recorded": 0,
+    }  # fmt: skip
     if not (folder / NAME).exists():
-        return PlanView()
+        return found
     try:
         submission = load_submission(folder)
     except PipelineError as error:
-        return PlanView(wrong=str(error))
+        return found | {"wrong": str(error)}
     system = submission.system
     names = parameter_names(system.carts, rigid=not system.bench.tied)
-    found = PlanView(
-        sound=True,
-        carts=system.carts,
-        recorded=len(submission.experiments),
-        units={"input": system.input.unit, "position": system.position.unit},
-        parameters=[(name, f"the {read_name(name).words}") for name in names],
-    )
+    found |= {
+        "carts": system.carts,
+        "recorded": len(submission.experiments),
+        "units": {"input": system.input.unit, "position": system.position.unit},
+        "parameters": [(name, f"the {read_name(name).words}") for name in names],
+    }
     try:
         plan = load_plan(submission) if plan_path(submission).exists() else None
     except PipelineError as error:
-        return replace(found, sound=False, wrong=str(error))
-    if plan is None:
-        return found
-    rows, left = _describe(plan, submission, why=_why_again(session), before=before)
-    return replace(found, rows=rows, left=left)
+        return found | {"wrong": str(error)}
+    found["sound"] = True
+    if plan is not None:
+        found |= _describe(plan, submission, why=_why_again(session), before=before)
+    return found
 
 
 def _describe(
@@ -381,7 +358,7 @@ def _describe(
     *,
     why: Mapping[str, str],
     before: Collection[str] | None,
-) -> tuple[list[dict[str, Any]], str]:
+) -> dict[str, Any]:
     """Return a row for each recording, and the total time of the recordings still to make."""
     done = {experiment.id for experiment in submission.experiments}
     left = [recording for recording in plan.recordings if recording.id not in done]
@@ -397,7 +374,7 @@ def _describe(
         }
         for one in plan.recordings
     ]
-    return rows, time_words(session_time(left)) if left else ""
+    return {"rows": rows, "left": time_words(session_time(left)) if left else ""}
 
 
 def _why_again(session: BenchSession | None) -> dict[str, str]:

@@ -25,11 +25,6 @@ _SAME = "same"  # value of the choice to leave points unchanged and only comment
 _DONE = "bulk_change"  # part of a page where the result is reported
 
 
-def show(ask: PageRequest) -> Response:
-    """Show the teams with their points before and after the change."""
-    return _show_page(ask)
-
-
 def apply(ask: PageRequest) -> Response:
     """Change all ticked teams, or undo a set of changes."""
     if ask.text("do") == "undo":
@@ -45,10 +40,10 @@ def apply(ask: PageRequest) -> Response:
         done = ask.gradebook.change_all(wishes, by=by)
     except Conflict:
         text = "Some of these teams have changed since this list was shown. Nothing was changed."
-        return _show_page(ask, wrong=text, status=409)
+        return show(ask, wrong=text, status=409)
     except ConfigError as error:
         text = capital(str(error).replace(" (--why)", "").replace(" (--by)", ""))
-        return _show_page(ask, wrong=f"{text}. Nothing was changed.", status=422)
+        return show(ask, wrong=f"{text}. Nothing was changed.", status=422)
     message = f"{count(done.teams, 'team')} changed in “{capital(asked.title or asked.id)}”."
     if unchanged := len(wishes) - done.teams:
         message += f" {unchanged} had these points already."
@@ -123,7 +118,8 @@ def _wish(
     )
 
 
-def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Response:
+def show(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Response:
+    """Show the teams with their points before and after the change."""
     shown = ask.class_view
     asked = _find_criterion(ask, shown)
     wanted = Filter.read(ask.request.query_params)
@@ -136,6 +132,7 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
     steps = list_steps(asked.points, shown.rubric)
     versions = {name: now.version(asked.id) for name, now, _ in rows}
     team, sent = ask.query("of"), ask.sent.getlist("team")
+    team_at = f"team?{urlencode({'of': team, 'criterion': asked.id})}"
     return ask.page(
         "bulk_change",
         status=status,
@@ -155,11 +152,16 @@ def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Respo
         message=partial(_message, asked),
         versions=versions,
         ticked=[name for name in versions if name in sent or ask.text("listed") != "1"],
-        moved=[name for name in versions if _is_moved(ask, name, versions[name])],
+        # Teams whose points somebody has changed since the list was shown.
+        moved=[
+            name
+            for name, now in versions.items()
+            if ask.request.method == "POST" and ask.text(f"seen.{name}") not in ("", now)
+        ],
         address=partial(write_address, ask, criterion=asked.id),
         wrong=wrong,
         signature=ask.signature,
-        back=_back(ask, team, asked) if team in shown.teams else f"{ask.here}?{wanted.query}",
+        back=ask.here + (team_at if team in shown.teams else f"?{wanted.query}"),
         team=team if team in shown.teams else "",
         wider=_widen(ask, shown, wanted),
     )
@@ -175,16 +177,6 @@ def _message(asked: Criterion, entry: Entry) -> str:
     """Return the message of a criterion to the team."""
     own = entry.grade.criterion(asked.id)
     return with_symbols(sentence(own.message)) if own else ""
-
-
-def _is_moved(ask: PageRequest, name: str, version: str) -> bool:
-    """Return whether somebody has changed a team's points since the list was shown."""
-    sent = ask.text(f"seen.{name}")
-    return ask.request.method == "POST" and sent not in ("", version)
-
-
-def _back(ask: PageRequest, team: str, asked: Criterion) -> str:
-    return f"{ask.here}team?{urlencode({'of': team, 'criterion': asked.id})}"
 
 
 def _name_set(wanted: Filter) -> str:

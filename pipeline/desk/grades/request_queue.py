@@ -20,11 +20,6 @@ from pipeline.words.numbers import NOTHING
 from pipeline.words.text import capital, with_symbols
 
 
-def show(ask: PageRequest) -> Response:
-    """Show the requests of the class or of one team."""
-    return _show_page(ask)
-
-
 def act(ask: PageRequest) -> Response:
     """Answer a request or reopen it; if somebody else has answered it, show that answer."""
     shown = ask.class_view
@@ -44,7 +39,7 @@ def act(ask: PageRequest) -> Response:
     except Conflict as conflict:
         return _show_conflict(ask, shown, conflict)
     except ConfigError as error:
-        return _show_page(ask, wrong=str(error), status=422)
+        return show(ask, wrong=str(error), status=422)
     return ask.back(_write_address(ask, ask.query("of")), message)
 
 
@@ -58,7 +53,8 @@ def _read_points(typed: str) -> float | None:
     return points
 
 
-def _show_page(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Response:
+def show(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Response:
+    """Show the requests of the class or of one team."""
     shown, of = ask.class_view, ask.query("of")
     book = ask.gradebook
     queue = book.queue(shown.team(of).submission if of else "")

@@ -89,11 +89,6 @@ def may_remove(ask: PageRequest, team: Entry) -> bool:
     return team.grade.status == "failed" and may_release(ask)
 
 
-def show(ask: PageRequest) -> Response:
-    """Show a team."""
-    return _show_page(ask)
-
-
 def act(ask: PageRequest) -> Response:
     """Do what the pressed button says: sign, accept, unmark, change points, or undo."""
     shown, team = ask.class_view, ask.team
@@ -141,7 +136,7 @@ def act(ask: PageRequest) -> Response:
         return _show_conflict(ask, team.grade.submission, conflict)
     except ConfigError as error:
         text = str(error).replace(" (--why)", "").replace(" (--by)", "")
-        return _show_page(ask, wrong=text, status=422)
+        return show(ask, wrong=text, status=422)
     if what == "adjust":
         return ask.back(
             f"{write_address(ask, team.grade.submission)}#total", "Saved.", place=_TOTAL
@@ -174,7 +169,7 @@ def _repair(ask: PageRequest, team: Entry, *, by: str) -> Response:
         ask.desk.workers.do("check_repair", folder=repairs, text=text)
         save_repair(place, team.submission, repair, of=ask.text("of_text"))
     except (ConfigError, Failed) as error:
-        return _show_page(ask, wrong_repair=str(error), status=422)
+        return show(ask, wrong_repair=str(error), status=422)
     message = "Saved. It counts when the class is graded again."
     if run := read_run(place):
         with suppress(Busy):  # another job is running in this folder
@@ -221,9 +216,10 @@ def send_paper(ask: PageRequest) -> Response:
     return served_files.send_paper(folder, name)
 
 
-def _show_page(
+def show(
     ask: PageRequest, *, wrong: str = "", wrong_repair: str = "", status: int = 200
 ) -> Response:
+    """Show a team, and why a form was refused."""
     shown, team = ask.class_view, ask.team
     grade, name = team.grade, team.grade.submission
     hidden = name if team.rubric.anonymous else ""
@@ -260,7 +256,8 @@ def _show_page(
         repair=repair,
         requests={criterion: request.state for criterion, request in team.requests.items()},
         recordings=folder,
-        notes=_show_notes(ask, folder) if folder else "",
+        # A worker makes the HTML, because the desk parses no file of a team.
+        notes=Markup(ask.desk.workers.do("render_notes", folder=str(folder))) if folder else "",
         papers=[
             (paper, f"{ask.here}paper?{urlencode({'of': name, 'file': paper})}")
             for paper in (_list_papers(folder) if folder else ())
@@ -571,11 +568,6 @@ def _shows(file: str, name: str) -> bool:
 
 
 # ------------------------------------------------------- the folder that was graded
-
-
-def _show_notes(ask: PageRequest, folder: Path) -> Markup:
-    """Return a team's notes as HTML. A worker makes it, because the desk parses no such file."""
-    return Markup(ask.desk.workers.do("render_notes", folder=str(folder)))
 
 
 def _list_papers(folder: Path) -> list[str]:

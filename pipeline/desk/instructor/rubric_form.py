@@ -1,7 +1,7 @@
 """A rubric as a form and a text; numbers typed into the form are written into the text."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from typing import Any
@@ -86,56 +86,45 @@ class RubricForm:
         yield self.step
         yield self.see
 
-    def with_fields(self, changed: Mapping[str, Field]) -> "RubricForm":
-        """Return the form with other fields, by path."""
 
-        def now(field: Field) -> Field:
-            return changed.get(field.path, field)
+def rubric_form(rubric: Rubric, changed: Mapping[str, Field] = {}) -> RubricForm:
+    """Return the values of a rubric as a form; missing values are filled in with their defaults.
 
-        def all_now(fields: Mapping[str, Field]) -> dict[str, Field]:
-            return {key: now(field) for key, field in fields.items()}
+    Parameters
+    ----------
+    changed : fields, by path, that are shown in place of the rubric's own.
+    """
 
-        return RubricForm(
-            criteria=tuple(
-                replace(
-                    one,
-                    points=now(one.points),
-                    tolerances=all_now(one.tolerances),
-                    source=now(one.source) if one.source else None,
-                )
-                for one in self.criteria
-            ),
-            late=all_now(self.late),
-            costs=all_now(self.costs),
-            step=now(self.step),
-            see=now(self.see),
-        )
+    def shown(field: Field) -> Field:
+        return changed.get(field.path, field)
 
-
-def rubric_form(rubric: Rubric) -> RubricForm:
-    """Return the values of a rubric as a form; missing values are filled in with their defaults."""
+    criteria = enumerate(rubric.criteria)
     return RubricForm(
-        criteria=tuple(_criterion(i, own, rubric.names) for i, own in enumerate(rubric.criteria)),
-        late={key: _amount(f"late.{key}", getattr(rubric.late, key)) for key in _LATE},
+        criteria=tuple(_criterion(i, own, rubric.names, shown) for i, own in criteria),
+        late={key: shown(_amount(f"late.{key}", getattr(rubric.late, key))) for key in _LATE},
         costs={
-            code: _amount(
-                f"flags.{code}" if cost.most == 1 else f"flags.{code}.least",
-                cost.least,
-                kind="share",
-                label=capital(WORDS.text(f"title_{code}")),
+            code: shown(
+                _amount(
+                    f"flags.{code}" if cost.most == 1 else f"flags.{code}.least",
+                    cost.least,
+                    kind="share",
+                    label=capital(WORDS.text(f"title_{code}")),
+                )
             )
             for code, cost in rubric.flags
         },
-        step=_amount("step", rubric.step),
-        see=replace(describe_field("students.see", Rubric), value=rubric.students.see),
+        step=shown(_amount("step", rubric.step)),
+        see=shown(replace(describe_field("students.see", Rubric), value=rubric.students.see)),
     )
 
 
-def _criterion(index: int, own: asked.Criterion, names: list[str]) -> CriterionFields:
+def _criterion(
+    index: int, own: asked.Criterion, names: list[str], shown: Callable[[Field], Field]
+) -> CriterionFields:
     def field(key: str) -> Field:
         # The id finds the criterion again if its place in the text has changed.
         amount = _amount(f"criteria.{index}.{key}", getattr(own, key))
-        return replace(amount, input=f"criteria.{own.id}.{key}")
+        return shown(replace(amount, input=f"criteria.{own.id}.{key}"))
 
     source = None
     if "from" in type(own).model_fields:
@@ -143,7 +132,7 @@ def _criterion(index: int, own: asked.Criterion, names: list[str]) -> CriterionF
         empty = describe_field("from", type(own))
         choices = tuple(filter(None, empty.choices))
         value = asked.source_of(own)
-        source = replace(empty, path=path, input=name, choices=choices, value=value)
+        source = shown(replace(empty, path=path, input=name, choices=choices, value=value))
     return CriterionFields(
         source=source,
         id=own.id,
@@ -279,12 +268,12 @@ def make_draft(edited: str, typed: Mapping[str, str]) -> RubricDraft:
     ----------
     typed : by name, the changed numbers of the form.
     """
-    rubric, mistakes = _parse(edited)
-    if rubric is None:
+    before, mistakes = _parse(edited)
+    if before is None:
         empty = json.dumps(dict.fromkeys(typed, ""))
         return RubricDraft(text=edited, edited=edited, rubric=None, mistakes=mistakes, form=None,
                            shown=empty, waiting=typed)  # fmt: skip
-    form = rubric_form(rubric)
+    form, rubric = rubric_form(before), None
     fields, text = {field.name: field for field in form.fields()}, edited
     changed = find_changes(fields.values(), typed)
     mistakes = [
@@ -300,7 +289,7 @@ def make_draft(edited: str, typed: Mapping[str, str]) -> RubricDraft:
         mistakes.append(Mistake(line=0, what=str(error)))
     if mistakes or rubric is None:
         fields |= {field.name: field for field in changed}
-        marked = form.with_fields(_mark(fields.values(), text, mistakes))
+        marked = rubric_form(before, _mark(fields.values(), text, mistakes))
         return RubricDraft(text=text, edited=edited, rubric=None, mistakes=mistakes, form=marked,
                            shown=_list_shown(form), waiting={})  # fmt: skip
     form = rubric_form(rubric)

@@ -24,11 +24,6 @@ from pipeline.words.numbers import NOTHING
 from pipeline.words.text import capital, rich
 
 
-def show(ask: PageRequest) -> Response:
-    """Show the points, then each criterion with its requests."""
-    return _show_page(ask)
-
-
 def send(ask: PageRequest) -> Response:
     """Ask for a review of a criterion; a reason that is refused is shown again as typed."""
     own, criterion, why = _find_own(ask), ask.text("criterion"), ask.text("why")
@@ -36,7 +31,7 @@ def send(ask: PageRequest) -> Response:
         book = _open_book(ask)
         book.ask(own.submission, criterion, why=why, by=ask.user.name, assignment=own.assignment)
     except RequestRefused as refused:
-        return _show_page(ask, refused={criterion: (why, str(refused))}, status=422)
+        return show(ask, refused={criterion: (why, str(refused))}, status=422)
     except ConfigError:
         raise ConfigError(_UNREADABLE) from None
     return ask.back(f"{ask.here}#criterion-{criterion}", "Sent. The answer will be on this page.")
@@ -84,9 +79,10 @@ def _read(ask: PageRequest) -> Entry | None:
         raise ConfigError(_UNREADABLE) from None
 
 
-def _show_page(
+def show(
     ask: PageRequest, *, refused: dict[str, tuple[str, str]] | None = None, status: int = 200
 ) -> Response:
+    """Show the points, then each criterion with its requests."""
     own, found = _find_own(ask), _read(ask)
     if found is None:
         shown = {"found": None, "submission": own.submission}

@@ -24,18 +24,13 @@ def show_report(ask: PageRequest) -> Response:
     return ask.page("report", title=title, room=read_room(ask), there=there, pdf=pdf)
 
 
-def show_questions(ask: PageRequest) -> Response:
-    """Show the questions of the report with the answers so far."""
-    return _show_questions(ask)
-
-
 def answer(ask: PageRequest) -> Response:
     """Write the answer to a question into `notes.md`; if it is refused, show it again as typed."""
     id_, words = ask.text("id"), ask.text("answer")
     try:
         found = _edit_notes(ask, "answer_question", id_=id_, words=words)
     except Failed as error:
-        return _show_questions(ask, status=422, refused={id_: (words, str(error))})
+        return show_questions(ask, status=422, refused={id_: (words, str(error))})
     label, place = f"Answer to {id_}", f"question-{id_}"
     return _show_written(ask, found, label=label, words=words, place=place)
 
@@ -46,7 +41,7 @@ def write_discussion(ask: PageRequest) -> Response:
     try:
         found = _edit_notes(ask, "write_discussion", words=words)
     except Failed as error:
-        return _show_questions(ask, status=422, discussion=(words, str(error)))
+        return show_questions(ask, status=422, discussion=(words, str(error)))
     return _show_written(ask, found, label="Discussion", words=words, place="discussion")
 
 
@@ -78,11 +73,11 @@ def state_signs(ask: PageRequest) -> Response:
     if "stale" in found:
         return show_stale(ask, NAME, found["stale"], changed=(), back=f"{ask.here}questions")
     if "fault" in found:
-        return _show_questions(ask, status=422, sign_error=found["fault"]["text"])
+        return show_questions(ask, status=422, sign_error=found["fault"]["text"])
     return ask.back(f"{ask.here}questions#question-sign", "Saved.", place="question-sign")
 
 
-def _show_questions(
+def show_questions(
     ask: PageRequest,
     *,
     status: int = 200,
@@ -90,7 +85,7 @@ def _show_questions(
     discussion: tuple[str, str] | None = None,
     sign_error: str = "",
 ) -> Response:
-    """Show the questions.
+    """Show the questions of the report with the answers so far.
 
     Parameters
     ----------

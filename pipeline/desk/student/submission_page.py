@@ -33,11 +33,6 @@ from pipeline.words.numbers import count, group_messages
 _FILES, _SET_UP = "files", "details"  # parts of pages, by their HTML ids
 
 
-def show(ask: PageRequest) -> Response:
-    """Show the room in its current state."""
-    return _show_page(ask)
-
-
 def upload(ask: PageRequest) -> Response:
     """Store uploaded files, and add tables for them to `submission.toml`."""
     folder, items = ask.folder(), ask.form.getlist("files")
@@ -198,7 +193,7 @@ def _go_back(ask: PageRequest, messages: Iterable[Message], place: str) -> Respo
     return ask.back(f"{ask.here}#{place}", *messages, place=place)
 
 
-def _show_page(
+def show(
     ask: PageRequest,
     *,
     status: int = 200,
@@ -254,5 +249,5 @@ def _edit(
             had="You typed" if known else "Your page had",
         )
     if "fault" in found:
-        return _show_page(ask, status=422, changed=changed, fault=Fault(**found["fault"]))
+        return show(ask, status=422, changed=changed, fault=Fault(**found["fault"]))
     return _go_back(ask, [Message("Saved.")], place)
