@@ -1,7 +1,6 @@
 """What TAs and students both see of a criterion: its evidence, and the steps of a request."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import count
 
 from pipeline.grading.grade import Criterion
@@ -40,19 +39,10 @@ _HEADS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShownStep:
-    """One event: who did what, when, and in which words."""
-
-    head: str
-    at: str
-    text: str
-
-
 def describe_steps(
     events: Iterable[Event], *, team: str = "", submission: str = ""
-) -> list[ShownStep]:
-    """Return the events of a request, oldest first.
+) -> list[dict[str, str]]:
+    """Return the events of a request, oldest first: who did what, when, and in which words.
 
     Parameters
     ----------
@@ -68,7 +58,7 @@ def describe_steps(
             head = f"{head}: {_describe_points(event.points)}"
         people = (submission, *event.authors, event.by * bool(hidden))
         text = hide_people(event.text, people) if team else event.text
-        shown.append(ShownStep(head=head, at=to_the_second(event.at), text=text))
+        shown.append({"head": head, "at": to_the_second(event.at), "text": text})
     return shown
 
 

@@ -77,7 +77,8 @@ def _entry(page: PageBuilder, effect: Effect) -> list[Block]:
         formula(effect.formula),
         effect_picture(page, term, chain, bench=BENCH),
         bullet_list(_WORDS.spans(f"effect_{key}", text=t) for key, t in facts.items() if t),
-        Code(hiding_command(term)),
+        # What simulates the bench of the picture.
+        Code(f"cartlab simulate --preset {BENCH} {hiding_option(term)} --out bench"),
     ]
 
 
@@ -102,13 +103,8 @@ def effect_picture(page: PageBuilder, term: EffectTerm, chain: Chain, *, bench: 
     return page.picture(effect.key, effect_figure(term, chain), _WORDS, "effect", **values)
 
 
-def hiding_command(term: EffectTerm) -> str:
-    """Return the command that simulates a bench with this effect, as in the picture."""
-    return f"cartlab simulate --preset {BENCH} {hiding_option(term)} --out bench"
-
-
 def hiding_option(term: EffectTerm) -> str:
-    """Return the option `--hide` of that command."""
+    """Return the option `--hide` of `cartlab simulate` for this effect."""
     place = [f"{term.effect.place}={term.place}"] if term.place else []
     pairs = zip(term.effect.parameters, term.values, strict=True)
     sizes = [f"{p.name}={value:.3g}" for p, value in pairs if p.reported]

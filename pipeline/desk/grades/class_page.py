@@ -3,7 +3,7 @@
 import zipfile
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,15 +44,6 @@ from pipeline.words.text import capital
 _ROWS = 50  # rows of one page
 _MOST_SETS = 20
 _MOST_NEWS = 8
-
-
-@dataclass(frozen=True, kw_only=True)
-class Counted:
-    """A flag or criterion, and the number of teams that have the flag or lost points for it."""
-
-    key: str
-    title: str
-    many: int
 
 
 def may_release(ask: PageRequest) -> bool:
@@ -127,18 +118,18 @@ def show_clean(ask: PageRequest) -> Response:
     )
 
 
-def count_flags(shown: ClassView) -> list[Counted]:
-    """Return the flags of a class, the most common first."""
+def count_flags(shown: ClassView) -> list[dict[str, Any]]:
+    """Return the flags of a class with the number of their teams, the most common first."""
     found = Counter(code for team in shown.teams.values() for code in team.grade.codes)
     common = sorted(found, key=lambda code: (-found[code], CODES.index(code)))
     titles = {code: capital(WORDS.text(f"title_{code}")) for code in common}
-    return [Counted(key=code, title=titles[code], many=found[code]) for code in common]
+    return [{"key": code, "title": titles[code], "many": found[code]} for code in common]
 
 
-def count_lost(shown: ClassView, titles: Mapping[str, str]) -> list[Counted]:
+def count_lost(shown: ClassView, titles: Mapping[str, str]) -> list[dict[str, Any]]:
     """Return the criteria in which points were lost, those with most teams first."""
-    found = [Counted(key=k, title=titles[k], many=len(v)) for k, v in shown.lost.items() if v]
-    return sorted(found, key=lambda one: -one.many)
+    lost = sorted(((key, len(names)) for key, names in shown.lost.items()), key=lambda one: -one[1])
+    return [{"key": key, "title": titles[key], "many": many} for key, many in lost if many]
 
 
 def show_news(ask: PageRequest) -> Response:
