@@ -28,7 +28,6 @@ from pipeline.resources import RUBRICS
 from pipeline.words.text import capital
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.desks import (
-    BOUNDARY,
     Answer,
     Visitor,
     a_submission,
@@ -107,11 +106,7 @@ def change(who: Visitor, team: str, criterion: str = "laws", seen: str = "", **f
 
 def upload(who: Visitor, path: str, name: str, content: str, **fields: str) -> Answer:
     """Send a form with a file in it."""
-    parts = [f'name="{key}"\r\n\r\n{value}' for key, value in fields.items()]
-    parts.append(f'name="{name}"; filename="t.csv"\r\n\r\n{content}')
-    lines = [f"--{BOUNDARY}\r\nContent-Disposition: form-data; {part}\r\n" for part in parts]
-    body = "".join([*lines, f"--{BOUNDARY}--\r\n"]).encode()
-    return who.send(path, body, kind=f"multipart/form-data; boundary={BOUNDARY}")
+    return who.upload(path, [("t.csv", content.encode())], name=name, **fields)
 
 
 # ---------------------------------------------------------------------------- the class

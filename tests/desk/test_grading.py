@@ -12,7 +12,7 @@ import pytest
 from pipeline.grading.gradebook.database import FILE
 from pipeline.grading.gradebook.gradebook import Gradebook
 from pipeline.grading.intake.repairs import Run, read_run, save_run
-from tests.helpers.desks import BOUNDARY, Answer, Visitor, at_desk, at_lab, listed_user
+from tests.helpers.desks import Answer, Visitor, at_desk, at_lab, listed_user
 from tests.helpers.grades import n_graded, write_class
 from tests.helpers.grading_students import write_team
 from tests.helpers.waiting import until
@@ -44,14 +44,7 @@ def packed(*teams: Path, **texts: str) -> bytes:
 
 def send(who: Visitor, path: str, *files: tuple[str, bytes], **fields: str) -> Answer:
     """Send the form, with uploaded files."""
-    parts = [(f'name="{name}"', value.encode()) for name, value in fields.items()]
-    parts += [(f'name="files"; filename="{name}"', raw) for name, raw in files]
-    body = b"".join(
-        f"--{BOUNDARY}\r\nContent-Disposition: form-data; {head}\r\n\r\n".encode() + raw + b"\r\n"
-        for head, raw in parts
-    )
-    whole = body + f"--{BOUNDARY}--\r\n".encode()
-    return who.send(path, whole, kind=f"multipart/form-data; boundary={BOUNDARY}")
+    return who.upload(path, files, **fields)
 
 
 def finish(who: Visitor, address: str) -> Answer:

@@ -3,12 +3,10 @@
 import re
 import socket
 import sys
-from contextlib import ExitStack
 from html import unescape
 from pathlib import Path
 from urllib.parse import quote, urlencode, urlsplit
 
-import psutil
 import pytest
 from starlette.datastructures import FormData
 from starlette.requests import Request
@@ -147,28 +145,6 @@ def test_a_request_that_is_too_long_is_refused(visitor, length):
                 line.sendall(b"186A0\r\n&a=" + b"x" * 99_997 + b"\r\n")
         assert line.recv(12) == b"HTTP/1.1 413"
     assert visitor.get("/").status == 200
-
-
-def test_idle_connections_are_few_and_short(visitor, monkeypatch):
-    """Of 300 connections without a request the desk holds only some, for a short time.
-
-    A visitor with the cookie is still served.
-    """
-
-    def held() -> int:
-        mine = psutil.Process().net_connections("tcp")
-        here = (c.laddr[1:] == (visitor.port,) and c.status == "ESTABLISHED" for c in mine)
-        return sum(here)
-
-    monkeypatch.setattr("pipeline.web._STRANGER_STAYS", 0.5)
-    with ExitStack() as opened:
-        for number in range(300):
-            stranger = socket.create_connection(("127.0.0.1", visitor.port), timeout=PATIENCE)
-            opened.enter_context(stranger)
-            if number % 30 == 0:
-                until(lambda: held() <= 140)
-        assert visitor.get("/").status == 200
-        until(lambda: held() <= 3)
 
 
 def test_a_port_that_is_taken_is_one_line(server):

@@ -93,14 +93,17 @@ class Visitor:
         """Send a form."""
         return self.send(path, urlencode(fields).encode(), kind="application/x-www-form-urlencoded")
 
-    def upload(self, path: str, files: Iterable[tuple[str, bytes]]) -> Answer:
-        """Send files."""
+    def upload(
+        self, path: str, files: Iterable[tuple[str, bytes]], *, name: str = "files", **fields: str
+    ) -> Answer:
+        """Send a form with files, which have this name in it, and with other fields."""
+        parts = [(f'name="{key}"', value.encode()) for key, value in fields.items()]
+        parts += [(f'name="{name}"; filename="{file}"', raw) for file, raw in files]
         body = b"".join(
-            f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="files"; '
-            f'filename="{name}"\r\n\r\n'.encode()
+            f"--{BOUNDARY}\r\nContent-Disposition: form-data; {head}\r\n\r\n".encode()
             + raw
             + b"\r\n"
-            for name, raw in files
+            for head, raw in parts
         )
         whole = body + f"--{BOUNDARY}--\r\n".encode()
         return self.send(path, whole, kind=f"multipart/form-data; boundary={BOUNDARY}")

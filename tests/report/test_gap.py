@@ -615,11 +615,3 @@ def test_hostile_text_in_a_gap_file_stays_text(bench):
 
     assert (page.count("img"), page.count("iframe"), page.count("script")) == (0, 0, 1)
     assert "<script>alert(1)</script>" in page.text
-
-
-def test_a_folder_without_a_submission_gives_one_line(tmp_path):
-    """If a folder is not a submission, `cartlab gap` ends with one line and status 2."""
-    done = cartlab_here("gap", tmp_path / "nowhere")
-
-    assert done.returncode == 2
-    assert len(done.stderr.strip().splitlines()) == 1

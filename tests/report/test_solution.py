@@ -294,16 +294,6 @@ def test_the_worked_gains_are_the_designed_ones(preset, method):
         assert_allclose(residual, 0.0, atol=1e-9 * np.abs(P).max())
 
 
-def test_ackermann_is_exact_in_symbols():
-    """For any plant with two states, Ackermann's formula gives the desired polynomial."""
-    a, b, c, d, e, f, p, q = sympy.symbols("a:f p q")
-    phi, gamma, z = sympy.Matrix([[a, b], [c, d]]), sympy.Matrix([e, f]), sympy.Symbol("z")
-    reach = sympy.Matrix.hstack(gamma, phi * gamma)
-    G = sympy.Matrix([[0, 1]]) * reach.inv() * (phi**2 + p * phi + q * sympy.eye(2))
-    loop = (z * sympy.eye(2) - phi + gamma * G).det()
-    assert sympy.simplify(loop - (z**2 + p * z + q)) == 0
-
-
 # ------------------------------------------------------------------- expected values
 
 

@@ -13,7 +13,7 @@ from tests.helpers.grades import write_class
 from tests.system import test_desk
 from tests.system.test_report_pages import PHONE
 
-show, fits = test_desk.show, test_desk.fits
+show, fits, walk_to = test_desk.show, test_desk.fits, test_desk.walk_to
 USERS = """
 [[users]]
 name = "s4"
@@ -47,15 +47,6 @@ def lab(tmp_path):
 def named(name: str) -> dict[str, str]:
     """Return the headers that the proxy adds."""
     return through_proxy(0, name).headers
-
-
-def walk_to(window, control, *, most: int = 60) -> None:
-    """Press Tab until the control has the focus."""
-    for _ in range(most):
-        if control.evaluate("one => one === document.activeElement"):
-            return
-        window.keyboard.press("Tab")
-    raise AssertionError(f"{most} times Tab did not reach {control}")
 
 
 def press(window, control, key: str = "Enter") -> None:

@@ -338,31 +338,15 @@ def test_pages_get_the_end_of_the_session(folder, monkeypatch):
 
 
 @pytest.fixture
-def show(browser, page):
-    """Open the page in a new window; script errors and requests to other hosts fail the test."""
-    contexts, errors = [], []
+def show(open_window, page):
+    """Open the page in a new window."""
 
-    def opened(*, size=WIDE, **options):
-        context = browser.new_context(
-            viewport={"width": size[0], "height": size[1]}, reduced_motion="reduce", **options
-        )
-        context.set_default_timeout(1e3 * PATIENCE)
-        contexts.append(context)
-        window = context.new_page()
-        window.on("pageerror", lambda error: errors.append(str(error)))
-        window.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
-        window.on(
-            "request",
-            lambda r: None if r.url.startswith(page.url) else errors.append(r.url),
-        )
-        window.goto(page.url)
+    def opened(**options):
+        window = open_window(page.url, **options)
         expect(window.locator("#title")).to_have_text(TITLE)
         return window
 
-    yield opened
-    for context in contexts:
-        context.close()
-    assert errors == []
+    return opened
 
 
 def record(page: LivePage) -> None:
