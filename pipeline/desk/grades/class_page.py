@@ -136,11 +136,7 @@ def show_news(ask: PageRequest) -> Response:
     """Show which points were changed since a page was loaded; empty if none were."""
     shown = ask.class_view
     since, latest = (_read_number(ask, name) for name in ("since", "told"))
-    answer = ask.page(
-        "news",
-        title="",
-        news=list_news(ask, shown, since=since),
-    )
+    answer = ask.page("news", title="", news=list_news(ask, shown, since=since))
     if shown.state[1] == latest:
         answer.headers["HX-Reswap"] = "none"
     return answer

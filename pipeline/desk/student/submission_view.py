@@ -155,14 +155,11 @@ _STEPS: tuple[tuple[str, str, str, Callable[[StepFacts], Status]], ...] = (
 def find_steps(facts: StepFacts) -> tuple[Step, ...]:
     """Return every step with its state."""
     left_out = ("report", "questions") if facts.check else ("check",)
-    found = [
-        (key, title, address, find(facts))
-        for key, title, address, find in _STEPS
-        if key not in left_out
-    ]
     return tuple(
         Step(key=key, title=title, address=address, state=state, word=word)
-        for key, title, address, (state, word) in found
+        for key, title, address, find in _STEPS
+        if key not in left_out
+        for state, word in [find(facts)]
     )
 
 
