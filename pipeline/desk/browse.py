@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Literal
 
@@ -58,10 +59,20 @@ def find_root() -> Path:
     return here if here != Path(here.anchor) else Path.home()
 
 
-def free_path(folder: Path, name: str) -> Path:
-    """Return a path in a folder that is not taken yet; a number is added to the name if needed."""
-    names = (name, *(f"{name}-{number}" for number in range(2, 1_000)))
-    return next(folder / one for one in names if not (folder / one).exists())
+def is_taken(path: Path) -> bool:
+    """Return whether something has this path, perhaps a link that leads nowhere."""
+    return path.exists() or path.is_symlink()
+
+
+def numbered(path: Path) -> Iterator[Path]:
+    """Yield a path, then further paths with a number added to the name."""
+    yield path
+    yield from (path.with_name(f"{path.stem}-{n}{path.suffix}") for n in count(2))
+
+
+def free_path(path: Path) -> Path:
+    """Return the first of these paths that is not taken yet."""
+    return next(one for one in numbered(path) if not is_taken(one))
 
 
 def list_folders(root: Path, inside: str) -> FolderList:

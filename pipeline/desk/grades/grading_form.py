@@ -84,7 +84,7 @@ def fill_form(ask: PageRequest, *, named: bool, is_first: bool = False) -> Gradi
 
 def show_new(ask: PageRequest) -> Response:
     """Show the form of a class that does not exist yet."""
-    out = free_path(ask.desk.root, _OUT).name
+    out = free_path(ask.desk.root / _OUT).name
     return _show(ask, GradingForm(out=out, is_first=True, rubrics=_list_rubrics(ask.user)))
 
 

@@ -53,7 +53,7 @@ def _show_form(
         found=found,
         chosen=[effect["key"] for effect in found["effects"]],
         shown=list(zip(found["effects"], pictures, strict=True)),
-        out=str(sent.get("out", free_path(ask.user.workshop or ask.desk.root, "exercise"))),
+        out=str(sent.get("out", free_path((ask.user.workshop or ask.desk.root) / "exercise"))),
         folders=str(sent.get("folders", "1")),
         seed=str(sent.get("seed", "0")),
         vary=str(sent.get("vary", "0")),

@@ -57,17 +57,6 @@ def own_rubrics(user: User) -> list[ListedRubric]:
     return list(found.values())
 
 
-def free_name(folder: Path) -> str:
-    """Return a file name that is still free in a folder: `rubric.toml`, `rubric-2.toml`, …"""
-    names = ("rubric.toml", *(f"rubric-{n}.toml" for n in range(2, 1000)))
-    return next((name for name in names if not (folder / name).exists()), "rubric.toml")
-
-
-def work_folder(user: User) -> Path:
-    """Return the folder for a new rubric."""
-    return user.workshop or find_root()
-
-
 def _roots(user: User) -> Sequence[Path]:
     if user.workshop:
         return (user.workshop,)

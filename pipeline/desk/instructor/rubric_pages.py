@@ -13,15 +13,14 @@ from urllib.parse import urlencode
 from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 
+from pipeline.desk.browse import find_root, free_path
 from pipeline.desk.form_input import keep_refusal, read_path
 from pipeline.desk.grades.grading_form import last_run
 from pipeline.desk.instructor.rubric_form import RubricDraft, make_draft, read_draft
 from pipeline.desk.instructor.rubric_list import (
-    free_name,
     own_rubrics,
     shipped_names,
     shipped_rubrics,
-    work_folder,
 )
 from pipeline.desk.page_request import PageRequest
 from pipeline.desk.served_files import show_drawing
@@ -171,7 +170,7 @@ def _read_rubric_path(ask: PageRequest) -> Path:
     """
     typed = ask.text("file")
     if not typed and ask.request.method == "GET":
-        typed = free_name(work_folder(ask.user))
+        typed = free_path((ask.user.workshop or find_root()) / "rubric.toml").name
     wanted = "enter a file name for the rubric, such as rubric.toml"
     path = read_path(typed, wanted=wanted, inside=ask.user.workshop)
     if path.suffix != ".toml":

@@ -7,11 +7,11 @@ bytes.
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import count
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
+from pipeline.desk.browse import free_path, is_taken, numbered
 from pipeline.desk.jobs import WorkerPool
 from pipeline.desk.last_report import NOTES, PDF, find_state
 from pipeline.desk.page_request import Message
@@ -148,9 +148,9 @@ def _take(sent_name: str, raw: bytes, folder: Path, *, room: _Room) -> Message |
     name = re.sub(r'[<>:"/\\|?*\x00-\x1f\x7f]|^[. ~]+|[. ]+$', "-", name)
     if DEVICE.fullmatch(name):
         name = f"data-{name}"
-    names = _list_names(own_folder(folder, "data") / name)
-    target = next(path for path in names if not _is_there(path) or _holds(path, raw))
-    if _is_there(target):
+    names = numbered(own_folder(folder, "data") / name)
+    target = next(path for path in names if not is_taken(path) or _holds(path, raw))
+    if is_taken(target):
         return Message(f"{quote(last)}: already exists", "changed")
     room.check(raw)
     target.parent.mkdir(exist_ok=True)
@@ -161,19 +161,8 @@ def _take(sent_name: str, raw: bytes, folder: Path, *, room: _Room) -> Message |
     return Message(f"{quote(last)}: saved as {target.name}{why}", "changed")
 
 
-def _is_there(path: Path) -> bool:
-    return path.exists() or path.is_symlink()
-
-
 def _holds(path: Path, raw: bytes) -> bool:
     return not path.is_symlink() and path.is_file() and path.read_bytes() == raw
-
-
-def _list_names(path: Path) -> Iterator[Path]:
-    """Yield a path, then further paths with a number added to the name."""
-    yield path
-    for number in count(2):
-        yield path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 def put_aside(file: str, folder: Path) -> str:
@@ -187,8 +176,7 @@ def put_aside(file: str, folder: Path) -> str:
     """
     aside = own_folder(folder, _ASIDE)
     aside.mkdir(exist_ok=True)
-    names = _list_names(aside / PurePosixPath(file).name)
-    target = next(path for path in names if not _is_there(path))
+    target = free_path(aside / PurePosixPath(file).name)
     try:
         (folder / file).rename(target)
     except FileNotFoundError:
