@@ -296,6 +296,7 @@ class PageRequest:
             "version": __version__,
             "folder": folder if self.user.sees_places else folder and Path(folder.name),
             "job": self.job,
+            "signature": self.signature,
             # Reading the messages removes them, so that they are shown only once.
             "messages": lambda place="": self.desk.messages.pop(self._room(place), []),
         }

@@ -160,7 +160,6 @@ def show(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Response:
         ],
         address=partial(write_address, ask, criterion=asked.id),
         wrong=wrong,
-        signature=ask.signature,
         back=ask.here + (team_at if team in shown.teams else f"?{wanted.query}"),
         team=team if team in shown.teams else "",
         wider=_widen(ask, shown, wanted),

@@ -72,7 +72,6 @@ def show(ask: PageRequest, form: GradingForm | None = None) -> Response:
         status=422 if form else 200,
         title=shown.rubric.title or name_place(ask.place_or_404()),
         teams=chosen[_ROWS * (page - 1) : _ROWS * page],
-        points=points_text,
         found=len(chosen),
         total=len(shown.teams),
         held=sum(bool(team.hold) for team in shown.teams.values()),
@@ -112,9 +111,7 @@ def show_clean(ask: PageRequest) -> Response:
         "clean",
         title="Teams without a flag",
         teams=[one for one in Filter(seen="no").chosen(shown) if not one.grade.in_doubt],
-        points=points_text,
         titles={id_: capital(title) for id_, title in shown.rubric.titles.items()},
-        signature=ask.signature,
     )
 
 

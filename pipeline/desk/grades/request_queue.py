@@ -76,7 +76,6 @@ def show(ask: PageRequest, *, wrong: str = "", status: int = 200) -> Response:
         settled=settled,
         n_waiting=queue.n_waiting,
         n_settled=queue.n_settled,
-        signature=ask.signature,
         most=MOST_LETTERS,
         wrong="" if any(one["wrong"] for one in (*waiting, *settled)) else wrong,
     )
