@@ -244,6 +244,10 @@ class PageRequest:
             return None
         return self.desk.visibility.show_job(self.desk.jobs.of(place), self.user, place)
 
+    def do(self, task: str, **arguments: Any) -> Any:
+        """Let a worker do a short task in the folder that the URL names; see `WorkerPool.do`."""
+        return self.desk.workers.do(task, folder=str(self.folder()), **arguments)
+
     def start(self, task: str, *, title: str, **arguments: Any) -> None:
         """Start a long task in the folder that the URL names.
 

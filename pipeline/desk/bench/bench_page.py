@@ -107,9 +107,7 @@ def show_comparison(ask: PageRequest) -> Response:
     try:
         wanted = _read_recording(typed, load_submission(folder)).model_dump(mode="json")
         goal = typed["goal"] or WORST
-        found = ask.desk.workers.do(
-            "weigh_recording", folder=str(folder), recording=wanted, goal=goal
-        )
+        found = ask.do("weigh_recording", recording=wanted, goal=goal)
     except PipelineError as error:
         return show(ask, status=422, typed=typed, refused=str(error))
     goal = typed["goal"]

@@ -28,7 +28,7 @@ def answer(ask: PageRequest) -> Response:
     """Write the answer to a question into `notes.md`; if it is refused, show it again as typed."""
     id_, words = ask.text("id"), ask.text("answer")
     try:
-        found = _edit_notes(ask, "answer_question", id_=id_, words=words)
+        found = ask.do("answer_question", id_=id_, words=words, seen=ask.text("seen"))
     except Failed as error:
         return show_questions(ask, status=422, refused={id_: (words, str(error))})
     label, place = f"Answer to {id_}", f"question-{id_}"
@@ -39,14 +39,10 @@ def write_discussion(ask: PageRequest) -> Response:
     """Write the discussion into `notes.md`; if it is refused, show it again as typed."""
     words = ask.text("discussion")
     try:
-        found = _edit_notes(ask, "write_discussion", words=words)
+        found = ask.do("write_discussion", words=words, seen=ask.text("seen"))
     except Failed as error:
         return show_questions(ask, status=422, discussion=(words, str(error)))
     return _show_written(ask, found, label="Discussion", words=words, place="discussion")
-
-
-def _edit_notes(ask: PageRequest, task: str, **typed: str) -> dict[str, Any]:
-    return ask.desk.workers.do(task, folder=str(ask.folder()), seen=ask.text("seen"), **typed)
 
 
 def _show_written(
@@ -63,13 +59,8 @@ def _show_written(
 
 def state_signs(ask: PageRequest) -> Response:
     """Write the sign of the input into the tables of runs whose sign the report reversed."""
-    folder = ask.folder()
-    found = ask.desk.workers.do(
-        "edit_file",
-        folder=str(folder),
-        seen=ask.text("seen"),
-        signs=read_findings(folder)["turned"],
-    )
+    signs = read_findings(ask.folder())["turned"]
+    found = ask.do("edit_file", seen=ask.text("seen"), signs=signs)
     if "stale" in found:
         return show_stale(ask, NAME, found["stale"], changed=(), back=f"{ask.here}questions")
     if "fault" in found:
@@ -95,7 +86,7 @@ def show_questions(
     """
     folder, room = ask.folder(), read_room(ask)
     findings = read_findings(folder)
-    found = ask.desk.workers.do("read_questions", folder=str(folder), ids=list(refused))
+    found = ask.do("read_questions", ids=list(refused))
     wrong = [*refused.values(), *([discussion] if discussion else [])]
     problems = [why for _, why in wrong] + [sign_error] * bool(sign_error)
     if found["problem"]:
@@ -182,12 +173,11 @@ def _is_busy(ask: PageRequest) -> bool:
 
 def show_check(ask: PageRequest) -> Response:
     """Show the last answer, and what the student can ask next."""
-    folder = ask.folder()
     # Read the job before the answers. If a check ends in between, the page then shows it as running
     # and asks again, instead of showing earlier answers as the result.
     busy = _is_busy(ask)
-    found = ask.desk.workers.do("describe_check", folder=str(folder))
-    title = f"Check of {folder.name}"
+    found = ask.do("describe_check")
+    title = f"Check of {ask.folder().name}"
     return ask.page("check", title=title, room=read_room(ask), busy=busy, **found)
 
 

@@ -38,13 +38,12 @@ def upload(ask: PageRequest) -> Response:
     folder, items = ask.folder(), ask.form.getlist("files")
     sent = [(i.filename, i.file) for i in items if isinstance(i, UploadFile) and i.filename]
     messages = take_uploads(sent, folder, workers=ask.desk.workers)
-    return _go_back(ask, [*messages, *_fill_tables(ask, folder)], _FILES)
+    return _go_back(ask, [*messages, *_fill_tables(ask)], _FILES)
 
 
 def set_aside(ask: PageRequest) -> Response:
     """Move a recording that no table names out of `data/`."""
-    folder, file = ask.folder(), ask.text("file")
-    message = ask.desk.workers.do("set_aside", folder=str(folder), file=file)
+    message = ask.do("set_aside", file=ask.text("file"))
     if message is None:
         raise HTTPException(404, "there is no such recording")
     return _go_back(ask, [Message(message)], _FILES)
@@ -52,7 +51,7 @@ def set_aside(ask: PageRequest) -> Response:
 
 def fill(ask: PageRequest) -> Response:
     """Add tables for data files without a table."""
-    return _go_back(ask, _fill_tables(ask, ask.folder()), _FILES)
+    return _go_back(ask, _fill_tables(ask), _FILES)
 
 
 def save(ask: PageRequest) -> Response:
@@ -105,7 +104,7 @@ def start_hand_in(ask: PageRequest) -> Response:
 def show_hand_in(ask: PageRequest) -> Response:
     """Show what is done, what is missing, what was assumed, and the content of the zip."""
     folder, room = ask.folder(), read_room(ask)
-    files = [] if room.keeps else _do(ask, "list_hand_in", report=not room.facts.check)
+    files = [] if room.keeps else ask.do("list_hand_in", report=not room.facts.check)
     return ask.page(
         "handin",
         title=f"Hand in: {folder.name}",
@@ -126,7 +125,7 @@ def download_hand_in(ask: PageRequest) -> Response:
     headers = {"Content-Disposition": disposition}
     with ExitStack() as scratch:
         packed = scratch.enter_context(scratch_folder()) / "hand-in.zip"
-        made_of = _do(ask, "pack_hand_in", into=str(packed), report=not ask.sees_check)
+        made_of = ask.do("pack_hand_in", into=str(packed), report=not ask.sees_check)
         ask.desk.handed[folder] = made_of
         return _Temporary(packed, scratch.pop_all(), headers=headers)
 
@@ -149,17 +148,12 @@ class _Temporary(FileResponse):
             self._scratch.close()
 
 
-def _do(ask: PageRequest, task: str, **arguments: Any) -> Any:
-    """Let a worker do a task in the folder that the URL names."""
-    return ask.desk.workers.do(task, folder=str(ask.folder()), **arguments)
-
-
 def _read_shown(ask: PageRequest) -> dict[str, Any]:
     """Return the version of `submission.toml` from which the form was filled in."""
     text = ask.desk.shown(ask.text("seen"), to=ask.user.name)
     if text is None:
-        return _do(ask, "read_folder", check=False)["document"]
-    return _do(ask, "read_document", text=text)
+        return ask.do("read_folder", check=False)["document"]
+    return ask.do("read_document", text=text)
 
 
 def _list_authors(room: SubmissionView) -> list[str]:
@@ -175,10 +169,10 @@ def _list_doubts(ask: PageRequest, document: Mapping[str, Any], index: int) -> S
     return looks[files[index]]["unsure"] if index < len(files) and files[index] in looks else ()
 
 
-def _fill_tables(ask: PageRequest, folder: Path) -> list[Message]:
+def _fill_tables(ask: PageRequest) -> list[Message]:
     """Add tables for new files; return messages."""
     try:
-        rows = ask.desk.workers.do("fill_tables", folder=str(folder))
+        rows = ask.do("fill_tables")
     except Failed as error:
         return [Message(str(error), "refused")]
     new = [row["file"] for row in rows if row["state"] in ("new", "completed")]
@@ -210,7 +204,7 @@ def show(
         room=room,
         file_groups=group_rows(room.rows),
         often=gather_remarks(room.rows),
-        not_read=_do(ask, "list_not_read", named=named),
+        not_read=ask.do("list_not_read", named=named),
         keeps=room.keeps if room.facts.is_valid else [],
         gap=file_problem(folder, "gap/gap.html") is None,
         plotted=not room.facts.check,
@@ -235,9 +229,9 @@ def _edit(
     """
     fields = [{"path": one.path, "kind": one.kind, "value": one.value} for one in changed]
     seen = ask.text("seen")
-    found = _do(ask, "edit_file", seen=seen, fields=fields, doubts=doubts, remove=remove)
+    found = ask.do("edit_file", seen=seen, fields=fields, doubts=doubts, remove=remove)
     if "stale" in found:
-        now = _do(ask, "read_document", text=found["stale"])
+        now = ask.do("read_document", text=found["stale"])
         # If the page is too old, nobody can tell which of its values were typed.
         known = ask.desk.shown(seen, to=ask.user.name) is not None
         return show_stale(

@@ -252,7 +252,7 @@ def read_room(
     """
     folder, sees_check = ask.folder(), ask.sees_check
     try:
-        found = ask.desk.workers.do("read_folder", folder=str(folder), check=sees_check)
+        found = ask.do("read_folder", check=sees_check)
     except Failed as error:  # the page still takes a new file
         found = {**_UNREADABLE, "fault": {"text": f"{NAME}: cannot be read ({error})"}}
     text, document, doubts = found["text"], found["document"], found["doubts"] or NO_QUESTIONS
