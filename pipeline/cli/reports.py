@@ -7,7 +7,6 @@ effects, schema.
 import json
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -364,35 +363,23 @@ def explain(
     """Write the gap analysis of a submission; return the text of gap.json and the messages."""
     with SecondProcess("pipeline.report.gap_report", "make_gap_files") as second:
         from pipeline.json_files import json_text
-        from pipeline.output import named_folder, own_folder, write_file
-        from pipeline.workflow import analyse
+        from pipeline.output import named_folder, own_folder
+        from pipeline.report.gap_files import make_gap, save_model
 
         submission = _load(folder)
         out = named_folder(out) if out else own_folder(submission.folder, "gap")
-        analysis = analyse(submission, design=False, progress=progress)
-        # These imports load the compiled simulator.
-        from pipeline.experiments.discriminate import propose_for
-        from pipeline.gap.explain import investigate
-        from pipeline.report.files import write_files
-        from pipeline.report.gap_files import clear_model, save_model
-        from pipeline.report.gap_verdict import terminal_verdict
+        found, analysis = make_gap(
+            submission, out, make=second.do, budget=budget, pdf=pdf, progress=progress
+        )
+    from pipeline.report.gap_verdict import terminal_verdict
 
-        found = investigate(analysis, budget=budget, progress=progress)
-        progress("choosing the next recording")
-        found = propose_for(found, submission)
-        drawn = replace(found, measure_left=tuple)  # which no page shows and no process can send
-        made = second.do(drawn, analysis, pdf=pdf, progress=progress)
-    out.mkdir(parents=True, exist_ok=True)
-    write_file(out / "gap.json", text := json_text(found))
-    clear_model(out)
     told = []
     if model:
         unseen = {i for r in analysis.records for i in r.free if i not in r.carts}
         free = unseen | {row.cart for row in found.by_record}
         told.append(save_model(found.model, analysis, out, free=free))
-    write_files(made, out, name="gap")
     wrote = _wrote(out, "gap", pdf=pdf)
-    return text, [*_unreadable(analysis), terminal_verdict(found), wrote, *told]
+    return json_text(found), [*_unreadable(analysis), terminal_verdict(found), wrote, *told]
 
 
 def _wrote(out: Path, name: str, *, pdf: bool) -> str:

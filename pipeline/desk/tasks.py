@@ -106,24 +106,13 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
 
 def make_gap(folder: str, *, progress: Progress) -> None:
     """Write the report on the gap into the submission's folder."""
-    from pipeline.experiments.discriminate import propose_for
-    from pipeline.gap.explain import investigate
-    from pipeline.json_files import json_text
-    from pipeline.report.files import write_files
-    from pipeline.report.gap_files import clear_model
+    from pipeline.report.gap_files import make_gap as write_gap
     from pipeline.report.gap_report import make_gap_files
-    from pipeline.workflow import analyse
 
     submission = load_submission(Path(folder))
     out = own_folder(submission.folder, "gap")
     with lock_or_refuse(out):
-        analysis = analyse(submission, design=False, progress=progress)
-        found = investigate(analysis, progress=progress)
-        found = propose_for(found, submission)
-        made = make_gap_files(found, analysis, progress=progress)
-        write_file(out / "gap.json", json_text(found))
-        clear_model(out)
-        write_files(made, out, name="gap")
+        write_gap(submission, out, make=make_gap_files, progress=progress)
 
 
 def make_plots(folder: str, *, progress: Progress) -> None:

@@ -1,15 +1,19 @@
-"""Files of a gap analysis: read the stored one, and save its model for other programs."""
+"""Files of a gap analysis: make them, read the stored one, save its model for other programs."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigError, DataError
+from pipeline.json_files import json_text
 from pipeline.output import write_file
 from pipeline.plant.effect import AugmentedChain
+from pipeline.report.files import Made, write_files
 from pipeline.results import Analysis
+from pipeline.submission import Submission
 from pipeline.submission.toml import read_text
+from pipeline.words.progress import Progress
 
 if TYPE_CHECKING:
     from pipeline.gap.types import Gap
@@ -77,6 +81,41 @@ def save_model(
     write_file(out / "model.m", matlab_source(description))
     alone = "" if compiled else "; without a C compiler, model.fmu has C sources but no binary"
     return f"wrote {out / 'model.fmu'}, model.c, model.h and model.m{alone}"
+
+
+def make_gap(
+    submission: Submission,
+    out: Path,
+    *,
+    make: Callable[..., Made],
+    budget: float | None = None,
+    pdf: bool = True,
+    progress: Progress,
+) -> tuple["Gap", Analysis]:
+    """Analyse the gap of a submission; write its report and `gap.json`.
+
+    Parameters
+    ----------
+    make : `make_gap_files`, or a function that calls it in another process.
+    budget : time limit of the search, in s.
+    """
+    from pipeline.workflow import analyse
+
+    analysis = analyse(submission, design=False, progress=progress)
+    # These imports load the compiled simulator.
+    from pipeline.experiments.discriminate import propose_for
+    from pipeline.gap.explain import investigate
+
+    found = investigate(analysis, budget=budget, progress=progress)
+    progress("choosing the next recording")
+    found = propose_for(found, submission)
+    drawn = replace(found, measure_left=tuple)  # which no page shows and no process can send
+    made = make(drawn, analysis, pdf=pdf, progress=progress)
+    out.mkdir(parents=True, exist_ok=True)
+    write_file(out / "gap.json", json_text(found))
+    clear_model(out)
+    write_files(made, out, name="gap")
+    return found, analysis
 
 
 def clear_model(out: Path) -> None:
