@@ -32,7 +32,7 @@ def bump(s: Array, *, span: Array | float) -> tuple[Array, Array, Array]:
     return b**4, 4 * b**3 * slope / span, (12 * b**2 * slope**2 - 8 * b**3) / span**2
 
 
-def bump_integral(s: Array) -> Array:
+def _bump_integral(s: Array) -> Array:
     """Return the integral of the bump from 0 to s; these are the weights for a held input."""
     return s**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], s)
 
@@ -90,7 +90,7 @@ class Windows:
     @cached_property
     def _held(self) -> Array:
         """Weights (…, samples - 1) for an input that is held after each sample."""
-        return np.diff(bump_integral(self._s), axis=1) / bump_integral(np.ones(1))
+        return np.diff(_bump_integral(self._s), axis=1) / _bump_integral(np.ones(1))
 
     def cut(self, x: Array) -> Array:
         """Return the samples (…, windows, samples) of signals (…, n)."""

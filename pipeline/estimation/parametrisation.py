@@ -89,7 +89,7 @@ class Parametrisation:
     def _places(self) -> NDArray[np.intp]:
         """Index (n_p,) of each free parameter in the flat vector (m, c, k)."""
         offset = {"m": 0, "c": self.n, "k": 2 * self.n}
-        return np.array([offset[symbol] + index for symbol, index in self.places])
+        return np.array([offset[symbol] + index for symbol, index in self.places], dtype=np.intp)
 
     def physical(self, chain: Chain) -> Array:
         """Return the free parameters (n_p,) of a chain, in physical units."""

@@ -220,20 +220,11 @@ def _describe_mistake(carts: Sequence[int], weights: Array) -> tuple[Correction,
 
 def _modes(chain: Chain) -> _ModesOf:
     """Return a function that finds the chain's modes for given free carts, without derivatives."""
-    P = Parametrisation(bench=Setup(springs=tuple(bool(k) for k in chain.k)))
-
-    @cache
-    def find(free: tuple[int, ...]) -> Modes:
-        modes = find_modes(chain, free=free, parametrisation=P, dp_dtheta=np.zeros(len(P.names)))
-        return replace(
-            modes,
-            d_poles=modes.d_poles[:0],
-            d_shapes=modes.d_shapes[:0],
-            d_entry=modes.d_entry[:0],
-            d_drive=modes.d_drive[:0],
-        )
-
-    return find
+    every = Parametrisation(bench=Setup(springs=tuple(bool(k) for k in chain.k)))
+    none = every.holding_at_zero(*every.names)
+    return cache(
+        lambda free: find_modes(chain, free=free, parametrisation=none, dp_dtheta=np.zeros(0))
+    )
 
 
 def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> RecordFit | None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
-from pipeline.estimation.force_balance import bump, bump_integral
+from pipeline.estimation.force_balance import Windows
 from pipeline.estimation.least_squares import minimise
 from pipeline.estimation.noise import (
     local_noise,
@@ -314,9 +314,10 @@ def _real_part(weights: ComplexArray, signals: ComplexArray) -> Array:
 # -------------------------------------------------------- the search, from a regression's result
 #
 # For the start, each cart's equation of motion is multiplied by a bump φ and integrated by parts
-# (`force_balance`). The result is
+# (`force_balance`). The result,
+# with means over the bump, is
 #
-#     m_i ∫ x_i φ'' - c_i ∫ x_i φ' + k_i ∫ (x_i - x_{i-1}) φ + k_{i+1} ∫ (x_i - x_{i+1}) φ = ∫ u φ.
+#     m_i x_i'' + c_i x_i' + k_i (x_i - x_{i-1}) + k_{i+1} (x_i - x_{i+1}) = u.
 #
 # Cart 1's equation gives its mass, damping and springs in input units. The equation of each further
 # cart gives them relative to the spring before it. An encoder zero acts as a constant force in its
@@ -342,16 +343,16 @@ def regress_chain(windows: Sequence[FitWindow], *, bench: Setup, width: float) -
     """
     n = bench.n
     m, c, k = np.zeros(n), np.zeros(n), np.zeros(n + 1)
-    moments = [_moments(window, n=n, width=width) for window in windows]
+    means = [_means(window, n=n, width=width) for window in windows]
     for cart in range(1, n + 1):
         seen = [
-            moment
-            for window, moment in zip(windows, moments, strict=True)
-            if moment is not None and _has_equation(window, cart, n)
+            mean
+            for window, mean in zip(windows, means, strict=True)
+            if mean is not None and _has_equation(window, cart, n)
         ]
         if not seen:
             return None
-        rows, targets = zip(*(_equation(cart, bench, *moment) for moment in seen), strict=True)
+        rows, targets = zip(*(_equation(cart, bench, *mean) for mean in seen), strict=True)
         zeros = np.zeros((sum(map(len, rows)), len(rows)))  # a constant force in each record
         ends = np.cumsum([0, *map(len, rows)])
         for column, (first, last) in enumerate(pairwise(ends)):
@@ -381,52 +382,36 @@ def _has_equation(window: FitWindow, cart: int, n: int) -> bool:
 def _equation(cart: int, bench: Setup, x: Array, force: Array) -> tuple[Array, Array]:
     """Return the columns of m, c and the springs of a cart's equation, and its right side.
 
-    The spring before the cart is a column only for cart 1; otherwise it is the right side. `x` (3,
-    n + 2, n_b) holds the moments of walls and carts with φ, φ', φ''; `force` (n_b,) holds the
-    moments of the input.
+    The spring before the cart is a column only for cart 1; otherwise it is the right side. `x` and
+    `force` are those of `_means`.
     """
     stretch = x[0, cart] - x[0, cart - 1], x[0, cart] - x[0, cart + 1]
-    columns = [x[2, cart], -x[1, cart], stretch[1] * bench.stiff[cart]]
+    columns = [x[2, cart], x[1, cart], stretch[1] * bench.stiff[cart]]
     if cart > 1:
         return np.stack(columns, axis=1), -stretch[0]
     columns.append(stretch[0] * bench.stiff[0])
     return np.stack(columns, axis=1), force
 
 
-def _moments(window: FitWindow, *, n: int, width: float) -> tuple[Array, Array] | None:
-    """Return the moments (3, n + 2, n_b) of the positions with φ, φ', φ'', and (n_b,) of the input.
+def _means(window: FitWindow, *, n: int, width: float) -> tuple[Array, Array] | None:
+    """Return means (3, n + 2, n_b) of position, velocity and acceleration, (n_b,) of the input.
 
-    φ = (τ (1 - τ))⁴, with τ from 0 to 1 over the bump. Walls, held and unmeasured carts are at
-    zero. The result is None if the record is shorter than two bumps, or if a bump holds too few
-    samples.
+    Walls, held and unmeasured carts are at zero. The result is None if the record is shorter than
+    two bumps, or if a bump holds too few samples.
     """
     t, duration = window.t, window.t[-1]
-    if duration < 2 * width or t.size * width / duration < _FEWEST_IN_BUMP:
+    samples = round(t.size * width / duration)
+    if duration < 2 * width or samples < _FEWEST_IN_BUMP:
         return None
     count = min(int((duration - width) / (_HOP * width)) + 1, _MOST_BUMPS)
-    starts = np.linspace(0.0, duration - width, count)
-    around = _around(t, starts, width)
-    tau = np.clip((t[around] - starts[:, None]) / width, 0.0, 1.0)
-    bumps = np.stack(bump(tau, span=width))
-    bumps *= np.gradient(t)[around]  # trapezoidal rule, accurate because bumps end smoothly
-    x = np.zeros((3, n + 2, count))
-    for cart, y in zip(window.carts, window.y, strict=True):
-        x[:, cart] = np.einsum("dbi,bi->db", bumps, y[around])
-    force = np.zeros(count)
+    first = np.linspace(0, t.size - samples, count).astype(np.intp)
+    x, force = np.zeros((3, n + 2, count)), np.zeros(count)
+    x[:, window.carts] = Windows(t, first=first, width=samples).means(window.y)
     if window.drive_u is not None:
-        around = _around(window.drive_t, starts, width)
-        tau = np.clip((window.drive_t[around] - starts[:, None]) / width, 0.0, 1.0)
-        # ∫ φ between samples. The input is held between samples, so its moment is exact.
-        area = width * bump_integral(tau)
-        force = np.sum(window.drive_u[around][:, :-1] * np.diff(area, axis=1), axis=1)
+        stride = window.stride
+        driven = Windows(window.drive_t, first=first * stride, width=(samples - 1) * stride + 1)
+        force = driven.held_mean(window.drive_u)
     return x, force
-
-
-def _around(t: Array, starts: Array, width: float) -> np.ndarray:
-    """Return indices (n_b, n_k) of the samples in each bump, and of one sample on either side."""
-    first = np.searchsorted(t, starts, side="right") - 1
-    last = np.searchsorted(t, starts + width, side="left")
-    return np.minimum(first[:, None] + np.arange(np.max(last - first) + 1), t.size - 1)
 
 
 def even_chains(windows: Sequence[FitWindow], *, bench: Setup) -> list[Chain]:

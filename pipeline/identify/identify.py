@@ -203,7 +203,7 @@ def _log_decrements(
             _skip_without(log, Stage.LOG_DECREMENT, what, out=out, cart=cart)
         for run in swinging:
             find = partial(_decays_between, between(run, interventions), cart=cart)
-            decays += log.attempt_once(Stage.LOG_DECREMENT, find, of=run.id, cart=cart) or ()
+            decays += log.attempt(Stage.LOG_DECREMENT, find, of=run.id, cart=cart) or ()
     return decays
 
 
@@ -251,7 +251,7 @@ def _step_gains(runs: Runs, *, bench: Setup, log: Log) -> list[StepGain]:
     for run in steps:
         for cart in run.carts:
             fit = partial(fit_static_gain, run, cart=cart)
-            gain = log.attempt_once(Stage.STEP_GAIN, fit, of=run.id, cart=cart)
+            gain = log.attempt(Stage.STEP_GAIN, fit, of=run.id, cart=cart)
             if gain:
                 gains.append(gain)
     return gains
@@ -263,7 +263,7 @@ def _sine_points(records: Sequence[Record], *, log: Log) -> list[SinePoint]:
         dwell = Dwell(run)
         for cart in run.carts if run.kind == "sine" else ():
             fit = partial(dwell.fit, cart=cart)
-            point = log.attempt_once(Stage.SINE, fit, of=run.id, cart=cart)
+            point = log.attempt(Stage.SINE, fit, of=run.id, cart=cart)
             if point and (fault := dwell_fault(point)):
                 log.skip(Stage.SINE, fault, run=run.id, cart=cart)
             elif point:

@@ -21,27 +21,24 @@ class Log:
     warnings: list[str] = field(default_factory=list)
     measured: Measured = field(default_factory=dict)
 
-    def attempt(self, stage: Stage, run: Callable[[], T], *, of: str = "") -> T | None:
+    def attempt(
+        self, stage: Stage, run: Callable[[], T], *, of: str = "", cart: int = 0
+    ) -> T | None:
         """Run one stage; if the data are unsuitable, note the reason and return None.
 
-        `of` is the id of the recording, if the stage uses only one.
+        `of` is the id of the recording, if the stage uses only one. A stage that also uses only one
+        `cart` of it is run only if `measured` lacks its result.
         """
-        try:
-            return run()
-        except DataError as error:
-            self.skip(stage, str(error), run=of)
-            return None
-
-    def attempt_once(self, stage: Stage, run: Callable[[], T], *, of: str, cart: int) -> T | None:
-        """Run a stage of one record as `attempt` does, but only if `measured` lacks its result."""
-        if (stage, of, cart) not in self.measured:
+        known = self.measured if cart else {}
+        key = stage, of, cart
+        if key not in known:
             try:
-                self.measured[stage, of, cart] = run()
+                known[key] = run()
             except DataError as error:
-                self.measured[stage, of, cart] = error
-        found = self.measured[stage, of, cart]
+                known[key] = error
+        found = known[key]
         if isinstance(found, DataError):
-            self.skip(stage, str(found), run=of, cart=cart)
+            self.skip(stage, str(found), run=of, cart=cart or None)
             return None
         return found
 

@@ -1,15 +1,11 @@
-"""The clock of a recording: its stamps are a rounded, sometimes interrupted view of even times.
+"""The clock of a recording: its stamps are a rounded, sometimes interrupted view of even times."""
 
-Near 1 kHz, stamps in whole milliseconds hardly show the clock's true period: a short record looks
-perfectly even. The records of a session share one clock, so together they reveal its period.
-"""
-
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
@@ -21,15 +17,9 @@ FEWEST_SAMPLES = 8  # fewest samples for any estimate
 _GAP = 4.0  # time is missing if an interval is this many times the usual one
 # Largest distance of a stamp from its line, in rounding steps: half a step, plus the fit's error.
 _ROUNDING_BAND = 0.65
-# Widths of a strip around a line, in rounding steps: 1 if stamps are only rounded, more if some
-# ticks of the clock are late.
-_BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * _ROUNDING_BAND)
 _REPEATS = 0.05  # share of stamps that repeat if a sample is shorter than their rounding
 # Ranges of clocks in s: 32 or 16 bits of µs or ms, or of the file's unit; a day; half a day.
 _RANGES = (2**32 * 1e-6, 2**32 * 1e-3, 2**16 * 1e-3, 2**16 * 1e-6, 2**32, 2**16, 86_400, 43_200)
-_HAIR = 1e-6  # numerical error of doubles, in rounding steps
-# A smaller range of slopes does not show the period; it comes from stamps that flicker.
-_NO_ROOM = 10 * _HAIR
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,13 +31,11 @@ class Clock:
     t : (n,) times in s, straightened unless `pieces` is 0.
     rounding : decimal step in s of which all stamps are multiples; zero if there is no such step.
     pieces : number of straight lines that replaced the rounded stamps; zero if they are unchanged.
-    period : interval of these lines in s if it is common to the session; otherwise None.
     """
 
     t: Array
     rounding: float
     pieces: int
-    period: float | None
 
     @property
     def mean_interval(self) -> float:
@@ -125,7 +113,7 @@ def clock_notes(
         even = "" if clock.pieces == 1 else f", in {clock.pieces} pieces"
         said = (
             f"time stamps rounded to {clock.rounding:g} s were replaced by even ones: "
-            f"one sample every {1e3 * (clock.period or interval):.4g} ms{even}"
+            f"one sample every {1e3 * interval:.4g} ms{even}"
         )
         notes.append(Note(said, "rounded", about=column.name))
     notes += [
@@ -182,64 +170,26 @@ def decimal_step(values: Array) -> float:
 
 
 def read_clock(stamps: Array) -> Clock:
-    """Check the time stamps (n,) of one record and undo their rounding."""
-    return read_clocks([stamps])[0]
-
-
-def read_clocks(session: Sequence[Array]) -> list[Clock]:
-    """Check the time stamps of every record of a session and undo their rounding.
+    """Check the time stamps (n,) of a record and undo their rounding.
 
     Stamps are straightened if their rounding step matters compared with the sample interval. They
     are replaced by straight lines that differ from them by no more than the rounding: one line if
-    the clock is even, several if it drifts or missed a tick. If a single period explains all lines,
-    they share it. If no such lines explain a clock, it is really uneven, and its stamps are kept.
+    the clock is even, several if it drifts or missed a tick. If no such lines explain a clock, it
+    is really uneven, and its stamps are kept.
     """
-    lines = [_lines(stamps, decimal_step(stamps)) for stamps in session]
-    clocks: list[Clock] = []
-    for one, period in zip(lines, _periods(lines), strict=True):
-        # Without a period, each line has its own slope; stamps on one line need none.
-        t, pieces = one.stamps, 0 if one.even and period is None else len(one.pieces)
-        if pieces:
-            t = t.copy()
-            for piece in one.pieces:
-                t[piece] = _line(one.stamps[piece], slope=period)
-        if (np.diff(t) <= 0).any():
-            t, pieces = _steady(one.stamps, one.rounding)
-        period = period if pieces else None
-        clocks.append(Clock(t=t, rounding=one.rounding, pieces=pieces, period=period))
-    return clocks
+    t, rounding, steps = stamps, decimal_step(stamps), np.diff(stamps)
+    pieces = () if np.ptp(steps) <= 1e-6 * _mean_step(stamps) else _pieces(stamps, rounding)
+    if pieces:
+        t = stamps.copy()
+        for piece in pieces:
+            t[piece] = _line(stamps[piece])
+    if (np.diff(t) <= 0).any():
+        t, count = _steady(stamps, rounding)
+        return Clock(t=t, rounding=rounding, pieces=count)
+    return Clock(t=t, rounding=rounding, pieces=len(pieces))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Lines:
-    """The stamps of a record, and its pieces that are straight but for rounding.
-
-    `even` means that the stamps already are on a line. They are then straightened only if other
-    records give a better period.
-    """
-
-    stamps: Array
-    rounding: float
-    pieces: tuple[slice, ...]
-    even: bool
-
-    def slopes(self, band: float) -> tuple[float, float]:
-        """Return the least and greatest period that fit all pieces; (inf, 0) if no period fits.
-
-        The usual stamps must be within a strip of `band` rounding steps around one line.
-        """
-        least, greatest = 0.0, np.inf
-        for piece in self.pieces:
-            stamps = self.stamps[piece]
-            usual = np.flatnonzero(_usual(stamps, self.rounding))
-            low, high = _slopes(usual, stamps[usual], width=band * self.rounding)
-            if (high - low) * stamps.size < _NO_ROOM * self.rounding:
-                return np.inf, 0.0
-            least, greatest = max(least, low), min(greatest, high)
-        return least, greatest
-
-
-def _lines(stamps: Array, rounding: float) -> _Lines:
+def _pieces(stamps: Array, rounding: float) -> tuple[slice, ...]:
     """Return the pieces that straight lines explain; none if they cover too little."""
     found: list[slice] = []
     mean, steps = _mean_step(stamps), np.diff(stamps)
@@ -249,7 +199,7 @@ def _lines(stamps: Array, rounding: float) -> _Lines:
     while waiting:
         start, end = waiting.pop()
         piece = stamps[start:end]
-        if _usual(piece, rounding).any():
+        if _is_straight(piece, rounding):
             found.append(slice(start, end))
         # Pieces of fewer than 32 samples would fit a line by chance.
         elif piece.size >= 2 * 32:
@@ -258,39 +208,7 @@ def _lines(stamps: Array, rounding: float) -> _Lines:
             waiting += [(middle, end), (start, middle)]
     # If straight pieces cover less than 80 %, the clock itself is uneven.
     explained = sum(piece.stop - piece.start for piece in found) >= 0.8 * stamps.size
-    return _Lines(
-        stamps=stamps,
-        rounding=rounding,
-        pieces=tuple(found) if explained else (),
-        even=bool(np.ptp(steps) <= 1e-6 * mean),
-    )
-
-
-def _periods(records: Sequence[_Lines]) -> list[float | None]:
-    """Return the period of each record's clock; records that allow the same period share it.
-
-    Each record confines the period to an interval, which is wider for a shorter record. Records
-    with narrow intervals come first. Each joins the first group whose period it allows, or starts a
-    new group. None means that the stamps are kept or no single period explains the record.
-    """
-    groups: list[tuple[float, float, list[int]]] = []
-    told = {i: [r.slopes(band) for band in _BANDS] for i, r in enumerate(records) if r.pieces}
-    for i, bounds in sorted(told.items(), key=lambda item: item[1][-1][1] - item[1][-1][0]):
-        for j, (least, greatest, members) in enumerate(groups):
-            shared = [(max(least, low), min(greatest, high)) for low, high in bounds]
-            allowed = [(low, high) for low, high in shared if low <= high]
-            if allowed and records[members[0]].rounding == records[i].rounding:
-                groups[j] = (*allowed[0], [*members, i])
-                break
-        else:
-            groups += [(low, high, [i]) for low, high in bounds if low <= high][:1]
-    common = {
-        i: (least + greatest) / 2
-        for least, greatest, members in groups
-        if not all(records[i].even for i in members)
-        for i in members
-    }
-    return [common.get(i) for i in range(len(records))]
+    return tuple(found) if explained else ()
 
 
 def _steady(stamps: Array, rounding: float) -> tuple[Array, int]:
@@ -327,21 +245,18 @@ def _pauses(stamps: Array, rounding: float) -> NDArray[np.intp]:
     return _late(stamps, min(float(np.median(np.diff(stamps))) or mean, mean) + rounding, rounding)
 
 
-def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:
-    """Return which stamps (n,) are within the rounding of one line.
-
-    Usually these are all stamps except for a few late ones. If more are off the line, no stamp
-    counts.
-    """
-    off = np.abs(_line(stamps) - stamps) / rounding
-    near = off <= _ROUNDING_BAND
+def _is_straight(stamps: Array, rounding: float) -> bool:
+    """Return whether stamps (n,) are within the rounding of one line, but for a few late ones."""
+    signed = (_line(stamps) - stamps) / rounding
+    off = np.abs(signed)
     # Very few stamps may be one step off, because a tick was late or missing.
-    if off.max() <= 1.5 and near.mean() >= 0.99:
-        return near
+    if off.max() <= 1.5 and np.mean(off <= _ROUNDING_BAND) >= 0.99:
+        return True
     # If a few stamps jump, a least-squares line tilts, but a strip of the rounding's width does
     # not. A stamp further from the line than 0.9 steps did not advance.
-    low, high = _slopes(np.arange(stamps.size), stamps, width=_BANDS[-1] * rounding)
-    return np.full(stamps.size, low <= high and off.max() < 0.9)
+    tilt = np.linspace(-1.0, 1.0, stamps.size)
+    narrowest = minimize_scalar(lambda x: np.ptp(signed - x * tilt), bounds=(-2, 2))
+    return bool(narrowest.fun <= 2 * _ROUNDING_BAND and off.max() < 0.9)
 
 
 def _centred(n: int) -> Array:
@@ -353,28 +268,3 @@ def _line(stamps: Array, *, slope: float | None = None) -> Array:
     i = _centred(stamps.size)
     slope = float((i @ stamps) / (i @ i)) if slope is None else slope
     return float(stamps.mean()) + slope * i
-
-
-def _slopes(index: NDArray[np.intp], stamps: Array, *, width: float) -> tuple[float, float]:
-    """Return the least and the greatest slope of a strip of this width that holds all stamps.
-
-    The width that they need is a convex, piecewise linear function of the slope, so Newton's method
-    from outside reaches each bound exactly. If there is no such strip, the least slope is inf and
-    the greatest is -inf.
-    """
-    hair = _HAIR * width + 8 * np.finfo(np.float64).eps * np.abs(stamps).max()
-    bounds = []
-    for side in (-1, 1):
-        slope = float((stamps[-1] - stamps[0] + side * 2 * width) / (index[-1] - index[0]))
-        while True:
-            off = stamps - slope * index
-            top, bottom = int(np.argmax(off)), int(np.argmin(off))
-            excess, run = off[top] - off[bottom] - width, index[bottom] - index[top]
-            if excess <= hair:
-                break
-            if run * side <= 0:
-                slope = -side * np.inf
-                break
-            slope -= excess / run
-        bounds.append(slope)
-    return bounds[0], bounds[1]

@@ -13,7 +13,7 @@ from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.bode_table import Points, frequency_responses, read_points
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
-from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clocks, time_stamps
+from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clock, time_stamps
 from pipeline.ingest.columns import (
     Column,
     assign_columns,
@@ -79,7 +79,7 @@ def read_data(submission: Submission) -> Ingested:
     experiments = submission.used
     system, taken = submission.system, {experiment.file for experiment in submission.experiments}
     tables: dict[str, tuple[list[FileTable], str]] = {}
-    opened: list[_Opened] = []
+    records: list[Record] = []
     points: Points = {}
     warnings: list[str] = []
     unreadable: dict[str, str] = {}
@@ -104,12 +104,7 @@ def read_data(submission: Submission) -> Ingested:
                 warnings += _read_bode(table, experiment, points)
                 tables_read.append(experiment.id)
             else:
-                opened.append(_open(table, experiment, system))
-    records: list[Record] = []
-    clocks = read_clocks([o.stamps for o in opened])  # the files of a session share one clock
-    for one, clock in zip(opened, clocks, strict=True):
-        with _noted(one.experiment, unreadable):
-            records.append(_read_record(one, clock))
+                records.append(_read_record(_open(table, experiment, system)))
     misnamed = _misnamed_columns(system, [table for read, _ in tables.values() for table in read])
     if len(unreadable) == len(experiments):
         (name, reason), *others = unreadable.items()
@@ -190,7 +185,7 @@ def _read_bode(table: FileTable, experiment: Experiment, points: Points) -> list
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Opened:
-    """A file with its columns identified; `positions` by cart, `stamps` (n,) in s as written.
+    """A file with its columns identified; `positions` by cart.
 
     Reading the file adds its notes to `notes` and the units of its headings to `headed`.
     """
@@ -200,7 +195,7 @@ class _Opened:
     experiment: Experiment
     columns: dict[str, Column]
     positions: list[Column]
-    stamps: Array
+    clock: Clock
     notes: list[str]
     headed: list[HeadingUnit] = field(default_factory=list)
 
@@ -235,21 +230,23 @@ def _open(table: FileTable, experiment: Experiment, system: System) -> _Opened:
     if unused or extra:
         names = ", ".join([*unused, *extra])
         notes.append(Note(f"columns not used: {names}", "unused", about=names))
+    stamps = time_stamps(table, columns.get("time"), sample_rate=experiment.sample_rate)
     return _Opened(
         system=system,
         table=table,
         experiment=experiment,
         columns=columns,
         positions=positions,
-        stamps=time_stamps(table, columns.get("time"), sample_rate=experiment.sample_rate),
+        clock=read_clock(stamps),
         notes=notes,
     )
 
 
-def _read_record(opened: _Opened, clock: Clock) -> Record:
+def _read_record(opened: _Opened) -> Record:
     """Return the record with the input's scale applied, but without an unknown sign."""
     table, experiment, columns = opened.table, opened.experiment, opened.columns
-    positions, notes, t = opened.positions, opened.notes, clock.t
+    positions, notes, clock = opened.positions, opened.notes, opened.clock
+    t = clock.t
     if (time := columns.get("time")) is not None:
         notes += clock_notes(table, time, clock, sample_rate=experiment.sample_rate)
     inside = _window(clock, experiment)

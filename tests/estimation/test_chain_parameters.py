@@ -17,41 +17,6 @@ from pipeline.plant.chain import PRESETS, Chain
 from pipeline.setup import Setup
 
 
-@st.composite
-def chains(draw: st.DrawFn) -> Chain:
-    """Draw chains of one to four carts with springs at both walls and values over two decades."""
-    n = draw(st.integers(1, 4))
-    size = st.floats(0.1, 10.0)
-    m, c, k = (
-        np.array(draw(st.lists(size, min_size=length, max_size=length))) for length in (n, n, n + 1)
-    )
-    if n == 1:
-        k[1] = 0.0
-    return Chain(m=3e-4 * m, c=5e-4 * c, k=0.06 * k)
-
-
-@given(chain=chains())
-def test_pack_and_unpack_are_inverse(chain):
-    """A chain converted to the fit's vector and back is the same up to rounding."""
-    P = Parametrisation(bench=Setup(springs=(True,) * (chain.n + 1)))
-
-    back = P.unpack(P.pack(chain))
-
-    # |ln p| < 10, so an error of 1e-16 in it causes 2e-15 in p.
-    assert_allclose(P.physical(back), P.physical(chain), rtol=1e-14)
-
-
-@given(chain=chains())
-def test_matrices_are_the_sum_of_the_directions(chain):
-    """Parameters times their derivative matrices give M, C and K."""
-    P = Parametrisation(bench=Setup(springs=(True,) * (chain.n + 1)))
-
-    for derivative, matrix in zip(P.matrix_derivatives, chain.matrices()[:3], strict=True):
-        built = np.einsum("pij,p->ij", derivative, P.physical(chain))
-        # Sums of two springs have one rounding of the larger spring.
-        assert_allclose(built, matrix, rtol=1e-14, atol=1e-14 * np.max(np.abs(matrix)))
-
-
 @pytest.mark.parametrize(
     ("springs", "names", "plain"),
     [
@@ -67,17 +32,6 @@ def test_the_vector_has_what_the_springs_allow(springs, names, plain):
 
     assert P.names == tuple(names.split())
     assert [n for n, log in zip(P.names, P.logarithmic, strict=True) if not log] == plain.split()
-
-
-def test_zero_parameters_leave_the_vector():
-    """If a parameter is held at zero, the vector has no entry for it, and it stays zero."""
-    P = Parametrisation(bench=Setup(springs=(True,) * 3)).holding_at_zero("c_2", "k_1")
-
-    chain = P.unpack(P.pack(PRESETS["throne-2dof"]))
-
-    assert P.names == ("m_1", "m_2", "c_1", "k_2", "k_3")
-    assert chain.c[1] == 0
-    assert chain.k[0] == 0
 
 
 def test_a_missing_spring_between_carts_is_refused():

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from pipeline.estimation.estimates import (
     DAMPING_LIMIT,
     GAIN_AND_FREQUENCY_LIMIT,
+    combine_repeats,
     compare,
     motion_measured,
 )
@@ -161,6 +162,19 @@ def test_the_papers_third_table_breaks_two_redundancies():
     value = {c.id: c.value for c in checks if c.value is not None}
     assert value["redundancy.R4"] > 0.1
     assert value["redundancy.R5"] > 0.02
+
+
+@pytest.mark.parametrize(
+    ("values", "std", "error"),
+    [
+        ([1.00, 1.02, 0.98, 1.01, 0.99], [1e-4] * 5, np.sqrt(2.5e-4 / 5)),  # of their spread
+        ([1.0, 1.0], [0.3, 0.4], 0.25),  # √(0.3² + 0.4²) / 2
+    ],
+)
+def test_repeats_have_the_error_of_their_spread_or_of_their_errors(values, std, error):
+    """The mean of repeats has the larger one of both errors."""
+    got = combine_repeats(values, std=std, source="step")
+    assert (got.value, got.std) == pytest.approx((1.0, error), rel=1e-12)
 
 
 def test_a_drift_and_a_sine_are_measured_where_they_are():

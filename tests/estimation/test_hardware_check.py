@@ -169,20 +169,6 @@ def test_a_gain_of_the_bench_20_percent_off_is_not_corrected():
         )
 
 
-def test_a_stated_sign_that_the_log_contradicts_is_noted():
-    """If the logged input has the opposite sign of the stated law, the log is used.
-
-    A note says so.
-    """
-    design, y, u = run_design(TWO, 2)
-
-    checks = check_hardware(record(y, u=-u, reference=STEPS), TWO, controller=stated(design))
-
-    assert "opposite sign" in checks[0].note
-    assert_allclose(known(checks[0].input_scale), -1.0, atol=1e-3)
-    assert checks[0].nrmse < 1.35 * noise_floor(y[0])
-
-
 def test_a_stated_scale_that_the_log_contradicts_is_noted():
     """If the scale of the PID was left out, the factor found in the log is used."""
     law = Pid(kp=2.0, kd=0.1, scale=0.009765625)

@@ -192,16 +192,6 @@ def test_the_driven_part_of_a_decay_is_left_out():
     assert_allclose(got.zeta, chain.zeta_carts[0], rtol=2e-3)
 
 
-@pytest.mark.parametrize("scale", [0.01, 1 / COUNT])
-def test_units_do_not_matter(scale):
-    """The damping is the same for positions in metres, centimetres or counts."""
-    run = released(zeta=0.05)
-    scaled = replace(run, y=run.y * scale, resolution=run.resolution * scale)
-    base, other = (fit_log_decrement(one, cart=1) for one in (run, scaled))
-    assert_allclose([other.zeta, other.zeta_std], [base.zeta, base.zeta_std], rtol=1e-6)
-    assert_allclose(other.amplitude, base.amplitude * scale, rtol=1e-9)
-
-
 # ----------------------------------------------------------------- dry friction
 
 

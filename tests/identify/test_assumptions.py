@@ -32,8 +32,8 @@ FREE = {  # free carts, with the origin and the support of the statement
 }
 
 
-def edited(folder: Path, *changes: tuple[str, str], head: str = "") -> Analysis:
-    """Return the analysis of a changed two-cart example; `head` is the heading of its CSV files."""
+def edited(folder: Path, *changes: tuple[str, str]) -> Analysis:
+    """Return the analysis of a changed two-cart example."""
     shutil.copytree(EXAMPLES / "two-cart", folder)
     toml = folder / "submission.toml"
     text = toml.read_text(encoding="utf-8")
@@ -41,9 +41,6 @@ def edited(folder: Path, *changes: tuple[str, str], head: str = "") -> Analysis:
         assert old in text
         text = text.replace(old, new)
     toml.write_text(text, encoding="utf-8")
-    for file in (folder / "data").glob("*.csv") if head else ():
-        lines = file.read_text(encoding="utf-8").split("\n", 1)
-        file.write_text(f"{head}\n{lines[1]}", encoding="utf-8")
     return analyse(load_submission(folder), design=False)
 
 
@@ -96,14 +93,6 @@ def test_an_unstated_value_is_a_default(tmp_path):
     assert unit.message in findings[0]  # at the top of the list
     assert "system.input.unit" in findings[1]
     assert sum(SPRINGS.strip() in line and spring.id in line for line in findings) == 1
-
-
-def test_headings_support_a_unit(tmp_path):
-    """A unit in the files' headings supports the same unit in `submission.toml`."""
-    analysis = edited(tmp_path / "s", head="time,input [mV],x1 [mm],x2 [mm]")
-    found = by_key(analysis)
-    assert [found["unit", unit].support for unit in ("cm", "V")] == ["supported", "supported"]
-    assert len(found["unit", "cm"].experiments) == len(analysis.records)
 
 
 @pytest.mark.parametrize(("headed", "support"), [(0, "open"), (3, "open"), (4, "supported")])

@@ -48,6 +48,7 @@ def test_the_essentials_are_printed(tmp_path):
         ("unused", "remark")
     ]
     assert got.positions.keys() == set(got.moving) == {1}
+    assert got.unusable == ()
 
 
 KINDS = {
@@ -171,13 +172,6 @@ def test_an_oscilloscope_that_names_its_units_beside_the_rows_is_no_decay(tmp_pa
     got = inspect_file(tmp_path / "F0000CH1.CSV")
     assert [column.name for column in got.columns] == ["TIME [s]", "CH1 [V]"]
     assert got.kind is None
-
-
-def test_a_file_with_a_remark_can_be_used(tmp_path):
-    """A column without a role is reported, but the file can still be used."""
-    got = inspect(tmp_path, time=T, input=np.sin(T), x1=X, temperature=X)
-    assert got.problems
-    assert got.unusable == ()
 
 
 @pytest.mark.parametrize(("unit", "refused"), [("V", False), ("furlong", True), ("cm", False)])

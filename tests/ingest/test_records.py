@@ -58,31 +58,25 @@ SINE = 'kind = "sine"'
 CM = 'position = { unit = "cm", per_count = 0.00227 }'
 
 
-def test_counts_become_position_units_once(tmp_path):
-    """Encoder columns of an ECP export are multiplied by per_count.
-
-    The encoder step is one count.
-    """
-    record = read(tmp_path, CM, STEP, ecp(reference=0 * X1, x1=X1, effort=U)).records[0]
-    assert_allclose(record.position(1), 0.00227 * X1, rtol=1e-15)
-    assert record.encoder_step(1) == 0.00227
-    assert record.position_scale == 0.00227
-    assert record.carts == (1,)
-    assert record.free == (1, 2)
+ECP = ecp(reference=0 * X1, x1=X1, effort=U)
+COUNTED = csv(time=T, input=U, x1=X1).replace("x1", "Encoder 1 Pos")
+POSITIONS = {
+    # name: what `[system]` states, content, position units per number in the file
+    "a stated count of an export": (CM, ECP, 0.00227),
+    "counts of an export": ("", ECP, 1.0),
+    "whole numbers of a CSV": (CM, csv(time=T, input=U, x1=X1), 1.0),
+    "a heading that says counts": (CM, COUNTED, 0.00227),
+}
 
 
-def test_positions_of_a_csv_are_not_scaled(tmp_path):
-    """per_count never applies to the columns x1 … of a CSV file, even if all are whole numbers."""
-    record = read(tmp_path, CM, STEP, csv(time=T, input=U, x2=X2, x1=X1)).records[0]
-    assert_array_equal(record.position(1), X1)
-    assert_array_equal(record.position(2), X2)
-
-
-def test_an_encoder_heading_in_a_csv_means_counts(tmp_path):
-    """A CSV column whose heading names encoder counts is converted like one of an export."""
-    content = csv(time=T, input=U, x1=X1).replace("x1", "Encoder 1 Pos")
-    record = read(tmp_path, CM, STEP, content).records[0]
-    assert_allclose(record.position(1), 0.00227 * X1, rtol=1e-15)
+@pytest.mark.parametrize("name", POSITIONS)
+def test_counts_become_position_units_once(name, tmp_path):
+    """Encoder counts are multiplied by `per_count`; the columns x1 … of a CSV never are."""
+    system, content, scale = POSITIONS[name]
+    record = read(tmp_path, system, STEP, content).records[0]
+    assert_allclose(record.position(1), scale * X1, rtol=1e-15)
+    assert record.encoder_step(1) == record.position_scale == scale
+    assert (record.carts, record.free) == ((1,), (1, 2))
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 0.1), ("m", 100.0), ("cm", 1.0)])
@@ -136,12 +130,6 @@ def test_a_copied_file_is_reported(tmp_path):
     assert facts(read_data(load_submission(tmp_path)).warnings)["copy"].about == "two.csv"
 
 
-def test_time_in_other_units_is_suspected(tmp_path):
-    """If samples are whole seconds apart, cartlab suspects milliseconds or sample numbers."""
-    record = read(tmp_path, "", STEP, csv(time=np.arange(N), input=U, x1=X1)).records[0]
-    assert facts(record.notes)["slow"].about == "time"
-
-
 def test_one_displacement_of_several_free_carts_needs_a_name(tmp_path):
     """If several carts are free, a single displacement column without a number is an error."""
     content = csv(**{"Time__us": np.round(1e6 * T), "Displacement__mm": X1})
@@ -151,50 +139,29 @@ def test_one_displacement_of_several_free_carts_needs_a_name(tmp_path):
     assert read(tmp_path, CM, named, content).records[0].carts == (1,)
 
 
-def test_whole_ecp_values_without_a_scale_are_counts(tmp_path):
-    """Whole numbers in an ECP export without a stated scale are counts."""
-    record = read(tmp_path, "", STEP, ecp(reference=0 * X1, x1=X1, effort=U)).records[0]
-    assert_array_equal(record.position(1), X1)
-
-
 @pytest.mark.parametrize(
-    ("system", "asked"),
+    ("system", "code", "said"),
     [
-        ("", True),
-        ('position = { unit = "count" }', True),
-        ('position = { unit = "cm" }', False),
-        ('position = { unit = "deg" }', False),
+        ("", "fractions", '"cm"'),
+        ('position = { unit = "count" }', "fractions", '"cm"'),
+        ('position = { unit = "cm" }', "", ""),
+        ('position = { unit = "deg" }', "", ""),
+        ('position = { unit = "furlong" }', "unknown_unit", "position"),
+        ('position = { unit = "CM" }', "unknown_unit", "'cm'"),
+        ('position = { unit = "µm" }', "", ""),
+        ('position = { unit = "in" }\ninput = { unit = "N" }', "", ""),
+        ('position = { unit = "turn" }\ninput = { unit = "duty" }', "", ""),
+        ('position = { unit = "rad" }\ninput = { unit = "A" }', "", ""),
+        ('position = { unit = "mm" }\ninput = { unit = "furlong" }', "unknown_unit", "input"),
     ],
 )
-def test_fractions_of_a_count_are_asked_about(system, asked, tmp_path):
-    """Positions with decimals are questioned if their unit is counts, stated or by default."""
+def test_a_unit_that_benches_do_not_use_is_asked_about(system, code, said, tmp_path):
+    """An unknown unit is questioned, and so are positions with decimals in counts."""
     folder = tmp_path / "s"
     data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
     checks = check_units(data.records, bench=load_submission(folder).system.bench)
-    assert [check.id for check in checks] == ["position_unit"] * asked
-    assert all('"cm"' in check.message for check in checks)
-
-
-@pytest.mark.parametrize(
-    ("system", "ids"),
-    [
-        ('position = { unit = "furlong" }', ["position_unit"]),
-        ('position = { unit = "CM" }', ["position_unit"]),
-        ('position = { unit = "µm" }', []),
-        ('position = { unit = "in" }\ninput = { unit = "N" }', []),
-        ('position = { unit = "turn" }\ninput = { unit = "duty" }', []),
-        ('position = { unit = "rad" }\ninput = { unit = "A" }', []),
-        ('position = { unit = "mm" }\ninput = { unit = "furlong" }', ["input_unit"]),
-    ],
-)
-def test_an_unknown_unit_is_asked_about(system, ids, tmp_path):
-    """A unit that benches do not use is questioned; known units are accepted."""
-    folder = tmp_path / "s"
-    data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
-    checks = check_units(data.records, bench=load_submission(folder).system.bench)
-    assert [check.id for check in checks] == ids
-    if "CM" in system:
-        assert "'cm'" in checks[0].message
+    assert [check.code for check in checks] == [code] * bool(code)
+    assert all(said in check.message for check in checks)
 
 
 def test_a_heading_in_another_unit_is_asked_about(tmp_path):
@@ -220,50 +187,43 @@ def bench_log(effort: np.ndarray) -> str:
     return "\n".join(lines) + "\n"
 
 
-@pytest.mark.parametrize(
-    ("system", "scale"), [("", DUTY_COUNT), ('input = { unit = "V", per_count = 0.002 }', 0.002)]
-)
-def test_duty_counts_become_input_units(system, scale, tmp_path):
-    """A bench log's effort counts 4096 to 5 V, unless the submission states another scale."""
-    duty = np.round(40_960 * U)
-    record = read(tmp_path, system, STEP, bench_log(duty)).records[0]
-    assert record.u is not None
-    assert_allclose(record.u, scale * duty, rtol=1e-15)
-    assert_allclose(record.input_scale, scale, rtol=1e-15)
-
-
 PER_COUNT = 'input = { unit = "V", sign = 1, per_count = 1e-4 }'
+DUTY, LARGE = np.round(40_960 * U), np.round(51_200 * U)
 
 
-@pytest.mark.parametrize("written", ["512", "512.0"])
-def test_duty_counts_of_a_csv_become_input_units(written, tmp_path):
-    """If a scale is stated, whole numbers too large for volts are taken as duty counts."""
-    duty = np.round(51_200 * U)
-    content = csv(time=T, input=duty, x1=X1).replace(",512,", f",{written},")
-    assert f",{written}," in content
-    data = read(tmp_path, PER_COUNT, STEP, content)
-    u = data.records[0].u
-    assert u is not None
-    assert_allclose(u, 1e-4 * duty, rtol=1e-15)
-    assert data.records[0].input_scale == 1e-4
-    assert data.warnings == ()
+def plain(u: np.ndarray) -> str:
+    return csv(time=T, input=u, x1=X1)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        csv(time=T, input=100 * U, x1=X1),
-        csv(time=T, input=U, x1=X1),
-        csv(time=T, input__V=3000 * U, x1=X1),
-    ],
-    ids=["a step of one volt", "fractions", "a heading in volts"],
-)
-def test_an_unneeded_scale_is_reported(content, tmp_path):
-    """An input in volts is not scaled, and a note says that per_count is not used."""
-    data = read(tmp_path, PER_COUNT, STEP, content)
-    assert data.records[0].input_scale == 1.0
-    assert len(data.warnings) == 1
-    assert [*facts(data.warnings)] == ["per_count_unused"]
+INPUTS = {
+    # name: what `[system]` states, how the input is written, its numbers, input units per number
+    "a bench log": ("", bench_log, DUTY, DUTY_COUNT),
+    "a stated duty count": (PER_COUNT, bench_log, DUTY, 1e-4),
+    "an effort with fractions": ("", bench_log, U, 1.0),
+    "large whole numbers": (PER_COUNT, plain, LARGE, 1e-4),
+    "the same with a point": (
+        PER_COUNT, lambda u: plain(u).replace(",512,", ",512.0,"), LARGE, 1e-4,
+    ),
+    "a step of one volt": (PER_COUNT, plain, 100 * U, 1.0),
+    "fractions": (PER_COUNT, plain, U, 1.0),
+    "a heading in volts": (
+        PER_COUNT, lambda u: csv(time=T, input__V=u, x1=X1), 3000 * U, 1.0,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_duty_counts_become_input_units(name, tmp_path):
+    """Duty counts are scaled: 4096 to 5 V, or as stated; a scale without counts is reported."""
+    system, write, numbers, scale = INPUTS[name]
+    data = read(tmp_path, system, STEP, write(numbers))
+    (record,) = data.records
+    assert record.u is not None
+    assert_allclose(record.u, scale * numbers, rtol=1e-15)
+    assert_allclose(record.input_scale, scale, rtol=1e-15)
+    unused = bool(system) and scale == 1.0
+    assert [*facts(data.warnings)] == ["per_count_unused"] * unused
+    assert len(data.warnings) == unused
 
 
 @pytest.mark.parametrize(
@@ -286,13 +246,6 @@ def test_a_wrong_column_of_all_files_is_named_if_nothing_can_be_read(tmp_path):
     """If no file can be read, the error names the wrong key of `[system] columns` first."""
     with pytest.raises(SubmissionError, match=r"columns: x1 .*'Wge'.*'Weg'"):
         read(tmp_path, 'columns = { x1 = "Wge" }', STEP, csv(time=T, input=U, Weg=X1))
-
-
-def test_an_effort_with_fractions_is_in_volts(tmp_path):
-    """An effort with fractions is taken as volts, not as duty counts."""
-    record = read(tmp_path, "", STEP, bench_log(U)).records[0]
-    assert record.u is not None
-    assert_array_equal(record.u, U)
 
 
 def test_the_bench_mat_layouts_agree_with_its_log(tmp_path):
@@ -370,30 +323,36 @@ def test_a_window_keeps_its_part_of_the_times(tmp_path):
     assert_allclose(both.t, T[10:21], atol=1e-6)  # the samples at both ends belong to it
 
 
-def test_gaps_in_time_are_noted_and_nothing_is_dropped(tmp_path):
-    """A log with a pause keeps all its samples, and a note names the gap."""
-    late = T + np.where(T > 2.0, 0.7, 0.0)
-    record = read(tmp_path, "", STEP, csv(time=late, input=U, x1=X1)).records[0]
-    assert record.t.size == N
-    assert facts(record.notes)["gap"].at == (np.argmax(T > 2.0),)
+LATE = csv(time=T + np.where(T > 2.0, 0.7, 0.0), input=U, x1=X1)
+CLIPPED = np.round(np.clip(1.5 * np.sin((3 + 2 * T) * T), -1.0, 1.0), 6)
+STUCK = np.round(440 * 5 * np.sin(6 * T))
+STUCK[200:240] = STUCK[199]
+SWEEP = csv(time=T, input=CLIPPED, x1=STUCK)
+COPY = np.round(0.5 * X1 + 0.5 * np.r_[0.0, X1[:-1]])
+SIX = csv(time=T, input=U, x1=X1, x3=X2, temperature=0 * T)
+NOTES = {
+    # name: experiment, content, code of the note, its column, its samples
+    "whole seconds": (STEP, csv(time=np.arange(N), input=U, x1=X1), "slow", "time", ()),
+    "a pause": (STEP, LATE, "gap", "", (np.argmax(T > 2.0),)),
+    "too many columns": (STEP, SIX, "unused", "temperature, x3", ()),
+    "a stuck encoder": ('kind = "sweep"', SWEEP, "stuck", "x1", (199, 239)),
+    "a clipped input": (
+        'kind = "sweep"', SWEEP, "clipped", "", tuple(np.flatnonzero(np.abs(CLIPPED) == 1.0)),
+    ),
+    "a commanded position that copies encoder 1": (
+        LOOP, ecp(reference=COPY, x1=X1, effort=U), "copied", "Commanded Pos", (),
+    ),
+}  # fmt: skip
 
 
-def test_columns_that_are_not_used_are_mentioned(tmp_path):
-    """A note names columns that are not used, such as a third encoder on a bench of two carts."""
-    content = csv(time=T, input=U, x1=X1, x3=X2, temperature=0 * T)
-    record = read(tmp_path, "", STEP, content).records[0]
-    assert facts(record.notes)["unused"].about == "temperature, x3"
-
-
-def test_a_broken_channel_is_noted(tmp_path):
-    """The notes of a record mention a stuck encoder and a clipped input."""
-    sweep = np.round(np.clip(1.5 * np.sin((3 + 2 * T) * T), -1.0, 1.0), 6)
-    x = np.round(440 * 5 * np.sin(6 * T))
-    x[200:240] = x[199]
-    record = read(tmp_path, "", 'kind = "sweep"', csv(time=T, input=sweep, x1=x)).records[0]
-    notes = facts(record.notes)
-    assert (notes["stuck"].about, notes["stuck"].at) == ("x1", (199, 239))
-    assert notes["clipped"].at == tuple(np.flatnonzero(np.abs(sweep) == 1.0))
+@pytest.mark.parametrize("name", NOTES)
+def test_what_is_odd_in_a_file_is_noted(name, tmp_path):
+    """A note names the column and the samples; nothing is dropped, and no copy is a reference."""
+    experiment, content, code, about, at = NOTES[name]
+    record = read(tmp_path, CM, experiment, content).records[0]
+    note = facts(record.notes)[code]
+    assert (note.about, note.at) == (about, at)
+    assert (record.t.size, record.reference) == (N, None)
 
 
 # ---------------------------------------------------------------- references and signs
@@ -406,14 +365,6 @@ def test_a_commanded_position_is_the_reference_under_feedback_only(tmp_path):
     assert closed.reference is not None
     assert (closed.reference.min(), closed.reference.max()) == (0.0, 2.27)
     assert read(tmp_path, CM, STEP, content).records[0].reference is None
-
-
-def test_a_mirrored_commanded_position_is_not_used(tmp_path):
-    """A commanded position that only copies encoder 1 is not used as reference."""
-    copy = np.round(0.5 * X1 + 0.5 * np.r_[0.0, X1[:-1]])
-    record = read(tmp_path, CM, LOOP, ecp(reference=copy, x1=X1, effort=U)).records[0]
-    assert record.reference is None
-    assert facts(record.notes)["copied"].about == "Commanded Pos"
 
 
 def test_a_stated_reference_replaces_that_of_the_file(tmp_path):
