@@ -7,6 +7,12 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
+def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return [start, stop) of each run of true values in a mask (n,)."""
+    edges = np.flatnonzero(np.diff(np.pad(mask.astype(np.int8), 1)))
+    return [(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
+
+
 def frozen_array(values: object, *, name: str, shape: tuple[int, ...] | None = None) -> Array:
     """Return a read-only float64 copy of an array, after checking its shape."""
     array = np.array(values, dtype=np.float64)

@@ -332,7 +332,10 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
             "motion that does not swing regularly"
         )
     fit, pole = decay.fit, complex(decay.fit.poles[0])
-    law, fitted = _law(decay), _fitted(decay)
+    exponential = _of_exponential(fit, decay.explained)
+    law = _law(decay.explained, exponential)
+    # With dry friction no damping ratio holds for small swings, so the number is the usual one.
+    fitted = exponential if law.is_friction else law
     unexplained = decay.rms(t, y) / float(np.ptp(y[decay.first : decay.stop]))
     # A fit with a larger residual belongs to another kind of motion. Real carts with dry friction
     # leave 1.3 to 2.1 % (ten runs).
@@ -383,57 +386,33 @@ class _Fitted(NamedTuple):
     omega_n_std: float
 
 
-def _fitted(decay: FreeDecay) -> _Fitted:
-    """Return the numbers of the law, or of the exponential if the law is dry friction or unknown.
-
-    With dry friction no damping ratio holds for small swings, so the number is the usual one.
-    """
-    law = decay.explained.law if decay.explained else None
-    return _of_exponential(decay) if law is None or law.name == "dry_friction" else _of_law(decay)
-
-
-def _of_exponential(decay: FreeDecay) -> _Fitted:
+def _of_exponential(fit: Ringing, explained: Explained) -> _Fitted:
     """Return the numbers of the exponential fit.
 
     Unlike noise, what the fit leaves beyond the noise does not average out, so it counts in full.
     """
-    pole, explained = complex(decay.fit.poles[0]), decay.explained
-    covariance = decay.fit.covariance[2:, 2:]
-    if explained and (left := explained.left[0]):
-        covariance = covariance * max(1.0, (explained.density + left) / decay.fit.variance)
+    pole, covariance = complex(fit.poles[0]), fit.covariance[2:, 2:]
+    if left := explained.left[0]:
+        covariance = covariance * max(1.0, (explained.density + left) / fit.variance)
     per_zeta = np.array([pole.imag**2, pole.real * pole.imag]) / abs(pole) ** 3
     per_omega = np.array([-pole.real, pole.imag]) / abs(pole)
     zeta_std, omega_n_std = (np.sqrt(per @ covariance @ per) for per in (per_zeta, per_omega))
     return _Fitted(-pole.real / abs(pole), float(zeta_std), abs(pole), float(omega_n_std))
 
 
-def _of_law(decay: FreeDecay) -> _Fitted:
-    """Return the numbers that the law implies; a damping ratio is at least zero."""
-    explained = decay.explained
-    if explained is None or explained.law is None:
-        return _of_exponential(decay)
-    zeta, omega_n, _ = explained.law.values
-    zeta_std, omega_n_std, _ = explained.errors
-    return _Fitted(max(float(zeta), 0.0), float(zeta_std), float(omega_n), float(omega_n_std))
-
-
-def _law(decay: FreeDecay) -> DecayLaw:
-    """Return the result of the test, and what the law implies."""
-    explained, implied = decay.explained, _of_law(decay)
-    assert explained is not None, "a decay that swings is tested"
-    size = size_std = float("nan")
+def _law(explained: Explained, exponential: _Fitted) -> DecayLaw:
+    """Return the result of the test, and what the law implies; a damping ratio is at least zero."""
+    implied, size, size_std = exponential, np.nan, np.nan
     if explained.law:
-        size, size_std = float(explained.law.values[2]), float(explained.errors[2])
+        (zeta, omega_n, size), (*errors, size_std) = explained.law.values, explained.errors
+        implied = _Fitted(max(zeta, 0.0), errors[0], omega_n, errors[1])
     return DecayLaw(
         name=explained.name,
         statistic=explained.departure.statistic,
         limit=explained.departure.limit,
-        size=size,
-        size_std=size_std,
-        zeta=implied.zeta,
-        zeta_std=implied.zeta_std,
-        omega_n=implied.omega_n,
-        omega_n_std=implied.omega_n_std,
+        size=float(size),
+        size_std=float(size_std),
+        **{name: float(value) for name, value in implied._asdict().items()},
     )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from pipeline.arrays import Array
+from pipeline.arrays import Array, true_runs
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA, resolution
 from pipeline.plant.chain import Chain
 from pipeline.results import Intervention, Record
@@ -439,9 +439,9 @@ def between(record: Record, interventions: Sequence[Intervention]) -> list[Recor
     if not touched.any():
         return [record]
     return [
-        record.part(slice(first, last + 1))
-        for first, last in _runs(~touched)
-        if record.t[last] - record.t[first] >= _GAP
+        record.part(slice(start, stop))
+        for start, stop in true_runs(~touched)
+        if record.t[stop - 1] - record.t[start] >= _GAP
     ]
 
 
@@ -462,8 +462,8 @@ def _bursts(cart: int, seen: Sequence[WindowMeans]) -> list[Intervention]:
         strong = (left > _FAR * bulk) & (share > least) & ~force.jumps
         above = left > _BEGINS * bulk
         times = np.concatenate([force.record.t[:1], force.t[1:-1], force.record.t[-1:]])
-        for first, last in _stretches(above, force.t):
-            inside = slice(first, last + 1)
+        for first, stop in _stretches(above, force.t):
+            inside = slice(first, stop)
             beyond = np.where(above[inside], force.residual[inside], 0.0)
             if _is_hand(beyond, strong=strong[inside], known=known[inside], hop=force.hop):
                 found.append(
@@ -471,7 +471,7 @@ def _bursts(cart: int, seen: Sequence[WindowMeans]) -> list[Intervention]:
                         experiment=force.record.id,
                         cart=cart,
                         start=max(float(times[first]) - _REACH, float(times[0])),
-                        end=min(float(times[last]) + _REACH, float(times[-1])),
+                        end=min(float(times[stop - 1]) + _REACH, float(times[-1])),
                     )
                 )
     driven = {
@@ -530,20 +530,14 @@ def _known(forces: Sequence[RecordResidualForce], size: float) -> list[NDArray[n
 
 
 def _stretches(above: NDArray[np.bool_], t: Array) -> list[tuple[int, int]]:
-    """Return first and last window of each stretch; stretches with a short gap are merged."""
+    """Return [start, stop) of each stretch of windows; stretches with a short gap are merged."""
     found: list[tuple[int, int]] = []
-    for first, last in _runs(above):
-        if found and t[first] - t[found[-1][1]] < _GAP:
-            found[-1] = (found[-1][0], last)
+    for start, stop in true_runs(above):
+        if found and t[start] - t[found[-1][1] - 1] < _GAP:
+            found[-1] = (found[-1][0], stop)
         else:
-            found.append((first, last))
+            found.append((start, stop))
     return found
-
-
-def _runs(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the first and the last index of each run of true values."""
-    edges = np.flatnonzero(np.diff(np.pad(above.astype(int), 1))).tolist()
-    return [(first, behind - 1) for first, behind in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _is_hand(
@@ -556,10 +550,10 @@ def _is_hand(
     """
     swings = np.count_nonzero(np.diff(np.sign(left[left != 0.0])))
     lasts = understood = 0
-    for first, last in _runs(strong):
-        burst = np.abs(left[first : last + 1])
+    for start, stop in true_runs(strong):
+        burst = np.abs(left[start:stop])
         lasts += np.count_nonzero(burst > 0.5 * burst.max())
-        understood += np.count_nonzero(known[first : last + 1])
+        understood += np.count_nonzero(known[start:stop])
     return bool(swings <= _SWINGS and lasts * hop >= _LASTS and understood * hop >= _KNOWN)
 
 

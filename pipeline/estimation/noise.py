@@ -1,6 +1,6 @@
 """The noise of a signal, its turning points and plateaus, and errors under correlation."""
 
-from functools import cache, lru_cache
+from functools import lru_cache
 from math import comb
 
 import numpy as np
@@ -124,13 +124,8 @@ def relative_psd(residual: Array, *, angle: float) -> float:
         return 1.0
     correlation = np.array([residual[:-lag] @ residual[lag:] for lag in range(1, lags)]) / power
     wave = np.cos(angle * np.arange(1, lags))
-    return max(1.0, float(1 + 2 * np.sum(_window(lags) * correlation * wave)))
-
-
-@cache
-def _window(lags: int) -> Array:
-    """Return Parzen's window at the lags 1 to `lags`."""
-    return _parzen(np.arange(1, lags) / lags)
+    window = _parzen(np.arange(1, lags) / lags)
+    return max(1.0, float(1 + 2 * np.sum(window * correlation * wave)))
 
 
 def long_run_variance(residual: Array) -> float:

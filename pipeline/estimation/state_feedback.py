@@ -151,8 +151,7 @@ class SampledPlant:
             # would settle in less than 25 samples.
             sample_time = min(0.00884, sampled_loop.RADIANS_PER_STEP / speeds.max(), settling / 25)
         self.sample_time = float(sample_time)
-        tied = chain.k[0] > 0 or chain.k[-1] > 0
-        held = 1 / chain.static_gains()[0] if tied else chain.m.sum() * self.rate**2
+        held = 1 / chain.static_gains()[0] if chain.is_tied else chain.m.sum() * self.rate**2
         self.stiffness = float(held)
         self.phi, self.gamma = self.after(1.0)
         if not (np.all(np.isfinite(self.phi)) and np.all(np.isfinite(self.gamma))):
@@ -191,7 +190,7 @@ def energy_weights(plant: SampledPlant, weights: Array) -> Array:
     """
     chain, n = plant.chain, plant.chain.n
     stiffness = chain.stiffness / plant.stiffness
-    if chain.k[0] == chain.k[-1] == 0:
+    if not chain.is_tied:
         # Without a spring to a wall, the mean position is weighted as if a spring held it.
         stiffness = stiffness + np.ones((n, n)) / n**2
     potential, kinetic = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n))
@@ -507,10 +506,8 @@ def _finish(
 def _message(plant: SampledPlant, task: Design, design: FeedbackDesign) -> str:
     """Return a warning if the goal cannot be met or model errors matter; otherwise ""."""
     parts = []
-    tied = plant.chain.k[0] > 0 or plant.chain.k[-1] > 0
-    limit = task.input_limit
-    held = np.inf
-    if tied and limit is not None:
+    limit, held = task.input_limit, np.inf
+    if plant.chain.is_tied and limit is not None:
         held = abs(plant.chain.static_gains()[plant.cart - 1]) * limit
     if not design.reachable and abs(task.reference) > held:
         parts.append(

@@ -290,7 +290,8 @@ def find_setups(driven: Sequence[Record], *, bench: Setup) -> tuple[RecordingGro
     for record in driven:
         held = _seems_held(record)
         # The carts before the first held one are a chain of their own.
-        if is_driven(record) and 1 not in held and held == tuple(range(*_tail(held, bench))):
+        alone = not held or held == tuple(range(held[0], bench.n + 1))
+        if is_driven(record) and 1 not in held and alone:
             by_held.setdefault(held, []).append(record)
     setups = [s for held, alike in by_held.items() for s in _setups(alike, held, bench=bench)]
     setups.sort(key=lambda one: len(one.members), reverse=True)
@@ -330,10 +331,6 @@ def _seems_held(record: Record) -> tuple[int, ...]:
     """Return the free carts that hardly move."""
     swings = {cart: float(np.ptp(record.position(cart))) for cart in record.carts}
     return tuple(cart for cart in little_motion(swings) if cart in record.free)
-
-
-def _tail(held: tuple[int, ...], bench: Setup) -> tuple[int, int]:
-    return (held[0], bench.n + 1) if held else (0, 0)
 
 
 def _setups(records: Sequence[Record], held: tuple[int, ...], *, bench: Setup) -> list[_Setup]:

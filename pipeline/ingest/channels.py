@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.arrays import Array
+from pipeline.arrays import Array, true_runs
 from pipeline.ingest.table import Note
 
 _FEWEST_COUNTS = 100  # a set point in counts
@@ -86,7 +86,7 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
     """
     moves = np.abs(np.diff(x))
     # A cart at a turning point may rest for fewer samples than this.
-    still = [run for run in _runs(moves == 0.0, least=10) if run[0] > 0]
+    still = [run for run in true_runs(moves == 0.0) if run[0] > 0 and run[1] - run[0] >= 9]
     moving = moves[moves > 0]
     if not still or moving.size < 3:
         return []
@@ -102,15 +102,6 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
         return (moves[first - 1] >= abrupt and back) or bool(on[:1].max(initial=0.0) >= jump)
 
     return [(first, last) for first, last in still if is_stuck(first, last)]
-
-
-def _runs(still: np.ndarray, *, least: int) -> list[tuple[int, int]]:
-    """Return first and last of each stretch of at least `least` equal samples.
-
-    still[i] means x[i] = x[i + 1].
-    """
-    runs = np.flatnonzero(np.diff(np.pad(still, 1))).reshape(-1, 2).tolist()
-    return [(first, last) for first, last in runs if last - first + 1 >= least]
 
 
 def saturation(u: Array) -> float | None:
@@ -131,11 +122,12 @@ def saturation(u: Array) -> float | None:
         # is 1.4.
         if limit == 0.0 or counts[top] < 5 * counts[following]:
             continue
-        at_limit = u == limit
-        for first, last in _runs(at_limit[:-1] & at_limit[1:], least=3):
+        for first, stop in true_runs(u == limit):
+            m = stop - first
+            if m < 3:
+                continue
             entry = abs(limit - u[first - 1]) if first > 0 else np.inf
-            leave = abs(limit - u[last + 1]) if last + 1 < u.size else np.inf
-            m = last - first + 1
+            leave = abs(limit - u[stop]) if stop < u.size else np.inf
             # Limit of the jump at both ends, in levels. The crest of a sine is a parabola: its m
             # samples can share one level only if the next sample is within this many levels.
             # Rounding adds one.

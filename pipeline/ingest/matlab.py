@@ -116,7 +116,9 @@ def _structure(name: str, fields: Mapping[str, Signal], *, source: str) -> FileT
     parts = [*fields.items()]
     if elements:
         parts = [("time", fields[key]) for key in fields if is_time(key)][:1]
-        parts += [(_label(one), one["values"]) for one in elements if "values" in one]
+        for one in elements:
+            label = printable(one["label"].text.strip()) if "label" in one else ""
+            parts += [(label, one["values"])] if "values" in one else []
     parts = [(label, v) for label, v in parts if v.values is not None and v.samples > 1]
     longest = max((v.samples for _, v in parts), default=0)
     columns: list[tuple[str, np.ndarray]] = []
@@ -136,11 +138,6 @@ def _structure(name: str, fields: Mapping[str, Signal], *, source: str) -> FileT
         format=_VECTORS if named else _MATRIX,
         run=name,
     )
-
-
-def _label(element: Mapping[str, Signal]) -> str:
-    """Return the label of a signal of Simulink, or ""."""
-    return printable(element["label"].text.strip()) if "label" in element else ""
 
 
 def _record(variables: Sequence[Signal], *, source: str) -> list[Signal]:
