@@ -21,14 +21,12 @@ _ADEQUATE = 1.5
 # Smallest swing to count, in grains. A grain is the encoder step, or the step whose rounding error
 # equals the noise if this is larger.
 _SMALLEST_SWING = 8.0
-_BASE_SKIPS, _BASE_NEEDS = 2, 4  # turning points skipped for the hand, and needed after them
 # Extended back in time, a fit may miss the record by this many of its own residuals. A share of the
 # amplitude is added while only the smaller swings were fitted, or if the residual exceeds the noise
 # anyway.
 _BACK_SIGMAS = 4.0
 _BACK_SHARES = (0.05, 0.0, 0.0, 0.0)
 _REAL_SHARE = 0.15
-_RELEASE_MARGIN = 1 / 40  # share of a period, in which the fingers leave the cart
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -206,7 +204,8 @@ def fit_decay(
         )
 
     enough = max(stop - noise.MIN_SAMPLES, stretch.first)
-    latest = min(run[min(_BASE_SKIPS, max(len(run) - _BASE_NEEDS, 0))], enough)
+    # Two turning points are skipped for the hand, if four others follow them.
+    latest = min(run[min(2, max(len(run) - 4, 0))], enough)
     decay = fit_from(latest)
     if decay.rms(t, y) > _ADEQUATE * floor:
         # The model does not cover the start of a real cart's motion, so the fit begins at the first
@@ -223,7 +222,8 @@ def fit_decay(
         decay = fit_from(first, after=decay, rough=rough)
     first = decay.first
     if first > stretch.first:
-        margin = t[first] + _RELEASE_MARGIN * 2 * interval
+        # The fingers leave the cart within a fortieth of a period.
+        margin = t[first] + 0.05 * interval
         first = min(int(np.searchsorted(t, margin)), latest)
     return fit_from(first, after=decay, last=True)
 

@@ -21,14 +21,8 @@ from pipeline.results import DecayCause
 # ------------------------------------------------------------- the departure from an exponential
 
 _CHANCE = 1e-4  # share of exponential decays that fail the test
-_PER_PERIOD = 16  # samples per period that are enough to tell the laws apart
 _ORDERS = 3, 8  # least and most order of the flexible change; in between, one for each period
-_SAME = 1e-3  # share of a column outside the others, below which it adds nothing
-_LINE = 25.0  # power of a line above the noise that chance does not reach
 _BINS = 24  # frequencies near that of the decay that give the noise
-# What may be left as noise: a share of the motion, or a multiple of the noise between neighbouring
-# samples. The flexible change cannot follow a second mode over many periods.
-_NOISE_SHARE, _NOISE_RATIO = 0.01, 10.0
 SECOND = 0.3, 3.0  # frequencies where a second mode may be, relative to that of the first
 UNKNOWNS = 6  # of an exponential decay with a drift
 
@@ -73,7 +67,8 @@ class Departure:
         flexible /= np.linalg.norm(flexible, axis=0)
         flexible -= basis @ (basis.T @ flexible)
         added, sizes, _ = np.linalg.svd(flexible, full_matrices=False)
-        added = added[:, sizes > _SAME]
+        # A column that lies outside the others by less than this adds nothing.
+        added = added[:, sizes > 1e-3]
         along = added.T @ left
         self.columns = along.size
         self.noise = noise = left - added @ along
@@ -83,11 +78,14 @@ class Departure:
         friction = friction - basis @ (basis.T @ friction)
         # Friction only ever brakes, so chance has twice its share on this side.
         rubbed = max(float(friction @ left), 0.0) ** 2 / float(friction @ friction) / density
-        most = max(_NOISE_SHARE * float(np.ptp(y)), _NOISE_RATIO * floor)
+        # What may be left as noise: a share of the motion, or a multiple of the noise between
+        # neighbouring samples. The flexible change cannot follow a second mode over many periods.
+        most = max(0.01 * float(np.ptp(y)), 10.0 * floor)
+        # By chance, no line reaches 25 times the power of the noise.
         self.statistic = max(
             float(along @ along) / along.size / density,
             limit / float(fdtri(1, freedom, 1 - 2 * _CHANCE)) * rubbed,
-            limit / _LINE * _highest_line(noise, angle=angle),
+            limit / 25.0 * _highest_line(noise, angle=angle),
             limit * (float(np.std(noise)) / most) ** 2 if most > 0 else 0.0,
         )
 
@@ -140,7 +138,8 @@ def thinned(t: Array, y: Array, *, omega: float) -> tuple[Array, Array]:
     """
     intervals = np.diff(t)
     usual = float(np.median(intervals))
-    size = int(2 * np.pi / omega / usual / _PER_PERIOD)
+    # Sixteen samples per period are enough to tell the laws apart.
+    size = int(2 * np.pi / omega / usual / 16)
     if size < 2 or np.max(np.abs(intervals - usual)) > 0.5 * usual:
         return t, y
     n = t.size // size * size
@@ -397,21 +396,8 @@ def _integral(values: Array, t: Array) -> Array:
 
 # ---------------------------------------------------------------------- the laws that compete
 
-_MARGIN = 6.0  # BIC by which the best law must be better than the next
-# Share of what the exponential leaves that a law may leave. On real carts, dry friction leaves 0.03
-# to 0.38; a wrong law may leave 0.23.
-_MOST_LEFT, _MOST_LEFT_BY_FRICTION = 0.2, 0.5
-# Unknowns that a law may have beyond the number of swings, unless it leaves only noise.
-_MORE_UNKNOWNS = 3
-_FEWEST_SWINGS = 4  # with fewer, most laws leave only noise
-_ROUGH = 1e-4  # relative tolerance of the squares in the competition
-_SIGMAS = 3.0  # a damping ratio further below zero is impossible
-_LEAST_ROUNDING = 0.1  # share of the rounding error that any fit leaves
-_LEAST_RATE = 0.1  # smaller decay rate of two modes, in the larger
 # Errors relative to the square of a shift, from simulated springs and pendulums.
 _NEGLECTED = np.array([1.0, 0.1, 1.0])  # of damping ratio, frequency and shift
-_MOST_SHIFT = 0.3  # relative shift of frequency up to which the series holds
-_APART = 0.5  # distance of two modes, in the larger decay rate
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -496,7 +482,8 @@ class _Candidate:
             least_squares.solve_linear(y, partial(self.model, t), p).residual for p in self.starts
         ]
         best = int(np.argmin([residual @ residual for residual in residuals]))
-        return self.fit_from(self.starts[best], t, y, precision=_ROUGH)
+        # In the competition, a rough fit is enough.
+        return self.fit_from(self.starts[best], t, y, precision=1e-4)
 
     def fit_from(self, start: Array, t: Array, y: Array, *, precision: float) -> LawFit | None:
         """Return the fit from a start, None if it makes no sense."""
@@ -593,7 +580,8 @@ def explain_decay(
             noise, columns, density = law.residual, law.unknowns, other
     n_eff = max(float(noise @ noise) / density, 2.0)
     # Rounding leaves this much even if the fit follows it.
-    least = n * (step**2 / size / 12) * _LEAST_ROUNDING
+    # Share of the rounding error that any fit leaves
+    least = n * (step**2 / size / 12) * 0.1
 
     def bic(squares: float, unknowns: int) -> float:
         return n_eff * float(np.log(max(squares, least) / n)) + unknowns * float(np.log(n_eff))
@@ -610,8 +598,10 @@ def explain_decay(
         within a swing.
         """
         swings = n * angle / np.pi
-        few = law.unknowns <= swings + _MORE_UNKNOWNS
-        exact = swings >= _FEWEST_SWINGS and not excess(law.squares)
+        # A law may have three unknowns more than there are swings, unless it leaves only noise.
+        few = law.unknowns <= swings + 3
+        # With fewer than four swings, most laws leave only noise.
+        exact = swings >= 4 and not excess(law.squares)
         return few or exact or law.name == "dry_friction"
 
     left = float(departure.left @ departure.left)
@@ -629,7 +619,9 @@ def explain_decay(
     full, over = None, excess(left)
     if best and _is_clear(best[0], bics, density=density):
         law, tried_one = best
-        most = _MOST_LEFT_BY_FRICTION if law.name == "dry_friction" else _MOST_LEFT
+        # Share of what the exponential leaves that a law may leave. On real carts, dry friction
+        # leaves 0.03 to 0.38; a wrong law may leave 0.23.
+        most = 0.5 if law.name == "dry_friction" else 0.2
         if excess(law.squares) <= most * over:
             full = tried_one.fit_from(law.p, t, y, precision=least_squares.PRECISION)
             name, over = (law.name, excess(law.squares)) if full else (name, over)
@@ -645,8 +637,10 @@ def explain_decay(
 def _is_clear(law: LawFit, bics: Mapping[str, float], *, density: float) -> bool:
     """Return whether the best law has a damping, and is clearly better than all others."""
     others = [bic for name, bic in bics.items() if name != law.name]
-    undamped = law.values[0] < -_SIGMAS * law.unit[0] * np.sqrt(density)
-    return not undamped and bics[law.name] + _MARGIN < min(others)
+    # A damping ratio cannot be three standard errors below zero.
+    undamped = law.values[0] < -3.0 * law.unit[0] * np.sqrt(density)
+    # The BIC of the best law must be better than the next one's by six.
+    return not undamped and bics[law.name] + 6.0 < min(others)
 
 
 def _candidates(
@@ -723,7 +717,8 @@ def _shift_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
     # The changes of the waveform are of second order in the shift.
     amplitude, *others = np.hypot(*linear[2:].reshape(-1, 2).T)
     small = max(others, default=0.0) < abs(shift) * amplitude / 2
-    return weights, abs(shift) < _MOST_SHIFT and small
+    # The series holds up to a relative shift of 0.3.
+    return weights, abs(shift) < 0.3 and small
 
 
 def _bend_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
@@ -744,9 +739,11 @@ def _main_mode(p: Array, linear: Array) -> tuple[int, int]:
 def _second_size(t: Array, p: Array, linear: Array) -> tuple[Array, bool]:
     """Return the weights of the smaller mode's frequency; the modes must be apart."""
     rates, frequencies = p.reshape(2, 2)
-    apart = abs(frequencies[1] - frequencies[0]) > _APART * np.max(np.abs(rates))
+    # The frequencies must differ by half of the larger decay rate.
+    apart = abs(frequencies[1] - frequencies[0]) > 0.5 * np.max(np.abs(rates))
     turns = float(np.min(frequencies)) * (t[-1] - t[0]) > 2 * np.pi
-    decays = float(np.min(rates)) > _LEAST_RATE * float(np.max(rates))
+    # The smaller decay rate must be a tenth of the larger one.
+    decays = float(np.min(rates)) > 0.1 * float(np.max(rates))
     return np.eye(10)[3 if _main_mode(p, linear) == (0, 2) else 2], apart and turns and decays
 
 

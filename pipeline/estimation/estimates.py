@@ -206,22 +206,14 @@ def _combined_sigmas(before: results.Estimate, after: results.Estimate) -> float
 # relies on the structure of the chain, so its standard error says nothing about a wrong structure.
 # A number counts as measured only if there are measurements at its own frequency.
 
-# Measurements must be within five half-widths (ζω) on both sides of a frequency, where a mode still
-# has a fifth of its peak, but not closer than the first or farther than the second of these shares.
-_HALF_WIDTHS, _NEAREST_LIMIT, _FARTHEST_LIMIT = 5.0, 0.1, 0.3
-# Largest relative standard error of a point that shows the height of a peak.
-_LARGEST_RELATIVE_STD = 0.2
-# A line of a spectrum is motion if it exceeds the noise by this factor. Noise alone does so once in
-# e^12.5 lines.
-_VISIBLE = 5.0
-
 
 def points_measured(responses: Iterable[results.FrequencyResponse]) -> Array:
     """Return the frequencies, rad/s, at which a frequency response has a point above its error."""
     seen = [np.zeros(0)]
     for r in responses:
         # A table states no errors; NaN counts as seen.
-        hidden = r.magnitude_std > _LARGEST_RELATIVE_STD * r.magnitude
+        # A point with a larger relative error does not show the height of a peak.
+        hidden = r.magnitude_std > 0.2 * r.magnitude
         seen.append(r.omega[~hidden & (r.omega > 0)])
     return np.unique(np.concatenate(seen))
 
@@ -242,7 +234,9 @@ def _visible(record: results.Record) -> Array:
         noise = max(local_noise(record.t, y), float(step) / np.sqrt(12))
         motion = np.interp(even, record.t, y)
         spectrum = np.abs(np.fft.rfft((motion - motion.mean()) * window, 2 * n))
-        seen |= spectrum > _VISIBLE * noise * np.linalg.norm(window)
+        # A line is motion if it exceeds five times the noise. Noise alone does so once in e^12.5
+        # lines.
+        seen |= spectrum > 5.0 * noise * np.linalg.norm(window)
     # The lowest lines hold the mean and the drift.
     return omega[seen & (omega > 4 * np.pi / (n * dt))]
 
@@ -291,6 +285,8 @@ def _coverage(name: str, *, omega: float, zeta: float, measured: Array) -> resul
     def nearest(there: Array) -> float | None:
         return float(there[np.argmin(np.abs(there - omega))]) if there.size else None
 
+    # Measurements must be within five half-widths (ζω) on both sides, where a mode still has a
+    # fifth of its peak. At least 10 % and at most 30 % of the frequency is allowed.
     return results.Coverage(
         of=name,
         omega=omega,
@@ -298,5 +294,5 @@ def _coverage(name: str, *, omega: float, zeta: float, measured: Array) -> resul
         # A point on the peak, within a half-width, counts as a point on both sides.
         below=nearest(measured[measured <= omega + half_width]),
         above=nearest(measured[measured >= omega - half_width]),
-        limit=float(np.clip(_HALF_WIDTHS * zeta, _NEAREST_LIMIT, _FARTHEST_LIMIT)),
+        limit=float(np.clip(5.0 * zeta, 0.1, 0.3)),
     )

@@ -142,7 +142,6 @@ _LAGS = (0.0, 0.02, 0.05)  # trial delays of the input, s
 # drag and braking; dry friction, constant and proportional to the input.
 _OWN, _POSITION = 2, 3
 _SPRINGS, _DAMPERS, _DRY = slice(0, 8), slice(8, 13), slice(13, 15)
-_ROUNDS, _SETTLED = 30, 1e-3  # most rounds of reweighting; change of the bulk at which they end
 _BULK = 2.0  # standard deviations of the residual; data beyond have little weight
 
 
@@ -338,7 +337,8 @@ def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Ar
         power[place] += (columns**2).sum(axis=0)
     scale = 1.0 / np.sqrt(np.where(power > 0.0, power, np.inf))
     weights, bulk, law = [np.ones(target.size) for _, target in parts], np.inf, np.zeros(count)
-    for _ in range(_ROUNDS):
+    # At most thirty rounds of reweighting; they end when the bulk changes by 0.1 %.
+    for _ in range(30):
         H, b = np.zeros((count, count)), np.zeros(count)
         for (columns, target), place, weight in zip(parts, places, weights, strict=True):
             weighed = columns.T * weight**2
@@ -350,7 +350,7 @@ def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Ar
                 for (columns, target), place in zip(parts, places, strict=True)]  # fmt: skip
         before = bulk
         bulk = max(_BULK * MEDIAN_TO_SIGMA * float(np.median(np.abs(np.concatenate(left)))), least)
-        if abs(bulk - before) < _SETTLED * bulk:
+        if abs(bulk - before) < 1e-3 * bulk:
             break
         weights = [1.0 / (1.0 + (one / bulk) ** 2) for one in left]
     return [law[place] for place in places], bulk
@@ -376,16 +376,9 @@ def running_max(values: NDArray[T], width: int) -> NDArray[T]:
 _FAR, _BEGINS = 4.0, 1.5
 # Least share of a burst in the force on the cart, and least ratio of this share to its usual value.
 _SHARE, _TYPICAL = 0.3, 3.0
-# s before and after a window. A burst is compared with the largest force in this time.
-_AROUND = 0.15
 # s on either side of a window's middle; this part has most of the weight.
 _REACH = 0.02
 _GAP = 0.1  # s; closer bursts are merged
-_LASTS = 0.06  # s above half the peak of a burst; an impact has 0.04, the width of a window
-# s of a burst during which the cart must be in a state in which the law holds at other times.
-_KNOWN = 0.03
-_SWINGS = 3  # sign changes of a hand's force; an effect's force has many more
-_INSTANT = 0.03  # s; nobody pushes twice within this time of a recording
 # Number of bins for a variable of the state. At least this share and at least this number of
 # the windows in a bin must be quiet.
 _BINS, _MOST, _VISITS = 20, 0.5, 5
@@ -489,8 +482,9 @@ def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[st
     """
     if one.start == driven.get(one.experiment, one.start):
         return False
+    # Nobody pushes twice within 0.03 s of the same instant.
     return any(
-        abs(one.start - other.start) < _INSTANT
+        abs(one.start - other.start) < 0.03
         for other in found
         if other.experiment != one.experiment and other.experiment in driven
     )
@@ -498,7 +492,8 @@ def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[st
 
 def _share(force: RecordResidualForce, size: float) -> Array:
     """Return which share of the force on the cart is unexplained, near each sample."""
-    acting = running_max(force.acting, 2 * round(_AROUND / force.hop) + 1)
+    # A burst is compared with the largest force within 0.15 s.
+    acting = running_max(force.acting, 2 * round(0.15 / force.hop) + 1)
     return np.abs(force.residual) / (acting + size)
 
 
@@ -554,7 +549,10 @@ def _is_hand(
         burst = np.abs(left[start:stop])
         lasts += np.count_nonzero(burst > 0.5 * burst.max())
         understood += np.count_nonzero(known[start:stop])
-    return bool(swings <= _SWINGS and lasts * hop >= _LASTS and understood * hop >= _KNOWN)
+    # An impact is above half of its peak for 0.04 s, the width of a window; a hand for longer.
+    # For 0.03 s, the cart must be in a state in which the law holds at other times.
+    # The force of a hand changes its sign at most three times, that of an effect more often.
+    return bool(swings <= 3 and lasts * hop >= 0.06 and understood * hop >= 0.03)
 
 
 # --------------------------------------------------------------- the delay of one cart's channel
@@ -569,7 +567,6 @@ def _is_hand(
 # slides along the records. The coefficients may have any sign and size. So a cart in
 # another unit, or with a reversed sign, gives the same delay.
 
-_FEWEST_PLACES = 30
 _MOST_LATE = 15  # grid steps tried in each direction
 _PARTS = 8  # fewest records, or parts of records, for a standard error
 
@@ -681,7 +678,7 @@ def _products(
     width = max(round(0.25 * period / step), 16)
     first, last = _MOST_LATE, t.size - width - _MOST_LATE
     places = np.arange(first, last, max(width // 6, (last - first) // 400, 1))
-    if places.size < max(_FEWEST_PLACES, parts):
+    if places.size < max(30, parts):
         return []
     windows = Windows(t, first=places, width=width)
 

@@ -28,15 +28,7 @@ from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
 
 # Least input, as a share of its strongest line. A weaker input does not excite the plant.
 _LEAST_INPUT_SHARE = 0.01
-# Least input, as a share of its strongest neighbour. At a null of the input's spectrum (every
-# second harmonic of a step on and off), the effect of any nonlinearity would be divided by almost
-# zero.
-_LEAST_NEIGHBOUR_SHARE = 0.25
 _NEIGHBOURS = 2  # frequencies on each side
-# Largest share of its travel that a cart may move in the first three samples of a record that
-# begins at rest. After a step at the first sample, it moves by u t²/2m in two samples. This is 3 %
-# with samples 9 ms apart and a mode at 20 rad/s.
-_START_SWING = 0.03
 _HALF_WINDOWS, _DEGREE = (4, 6), 2  # lines on each side, and degree, of the local polynomials
 
 
@@ -99,7 +91,9 @@ def _at_rest_ratio(run: Record, u: Array, omega: Array) -> TransferRatio | None:
     quiet = np.maximum(8 * noise, 2 * run.resolution)  # largest range of a cart that stands still
     # A cart is also at rest if it moves by less than a hundredth of its whole travel.
     moving = np.ptp(u[tail]) > 0 or np.any(ring > np.maximum(quiet, 0.01 * travel))
-    starts_moving = np.any(np.ptp(run.y[:, :3], axis=1) > np.maximum(quiet, _START_SWING * travel))
+    # After a step at the first sample, a cart at rest moves by u t²/2m in two samples. This is 3 %
+    # of its travel with samples 9 ms apart and a mode at 20 rad/s.
+    starts_moving = np.any(np.ptp(run.y[:, :3], axis=1) > np.maximum(quiet, 0.03 * travel))
     if moving or starts_moving:
         return None
     first_change = int(np.argmax(u != u[0]))
@@ -118,7 +112,10 @@ def _at_rest_ratio(run: Record, u: Array, omega: Array) -> TransferRatio | None:
 def _ratio(Y: ComplexArray, U: ComplexArray, *, std: Array) -> TransferRatio:
     size = np.abs(U)
     around = sliding_window_view(np.pad(size, _NEIGHBOURS), 2 * _NEIGHBOURS + 1).max(axis=-1)
-    excited = size > np.maximum(_LEAST_INPUT_SHARE * np.max(size), _LEAST_NEIGHBOUR_SHARE * around)
+    # At a null of the input's spectrum (every second harmonic of a step on and off), the effect of
+    # any nonlinearity would be divided by almost zero. So the input must be at least a quarter of
+    # its strongest neighbour.
+    excited = size > np.maximum(_LEAST_INPUT_SHARE * np.max(size), 0.25 * around)
     U = np.where(excited, U, 1.0)
     return TransferRatio(G=Y / U, std=np.where(excited, std / np.abs(U), np.inf))
 
@@ -187,9 +184,6 @@ def _local_polynomials(
 
 # ---------------------------------------------------------------------- dwells
 
-# Two dwells are repeats if their frequencies differ by less than this. A fitted frequency is
-# accurate to some 1e-4. Within this limit, no response changes by more than its standard error.
-_SAME_FREQUENCY = 1e-3
 # No bench measures more accurately, and exact data would get infinite weight.
 _SMALLEST_RELATIVE_STD = 1e-6
 
@@ -231,7 +225,10 @@ def _collect_cart(points: Sequence[SinePoint], *, cart: int) -> FrequencyRespons
     ordered = sorted(points, key=lambda p: p.omega)
     groups = [[ordered[0]]]
     for before, point in pairwise(ordered):
-        if point.omega > before.omega * (1 + _SAME_FREQUENCY):
+        # Two dwells are repeats if their frequencies differ by less than 0.1 %. A fitted frequency
+        # is accurate to some 1e-4, and within this limit no response changes by more than its
+        # error.
+        if point.omega > before.omega * 1.001:
             groups.append([])
         groups[-1].append(point)
     rows = []
@@ -356,8 +353,6 @@ def _combined(omega: Array, rows: Sequence[tuple[ComplexArray, Array]]) -> list[
 
 # ------------------------------------------------------------- peaks and nulls
 
-# A mode has been passed where the response has fallen by this factor from low frequencies.
-_CLEAR_FALL = 3.0
 # Share of the first resonance. At a lower frequency, the magnitude gives the static gain.
 _LOW_SHARE = 0.7
 
@@ -500,7 +495,8 @@ def _with_damped_mode(response: FrequencyResponse, modes: Sequence[_Extremum]) -
     for mode in modes:
         fall -= np.log(np.abs(1 - (omega / mode.omega) ** 2))
     found = omega / np.sqrt(np.exp(np.maximum(fall, 0.0)) + 1)
-    usable = found[fall > np.log(_CLEAR_FALL)]
+    # Where the response has fallen to a third, a mode has been passed.
+    usable = found[fall > np.log(3.0)]
     if usable.size == 0:
         return list(modes)
     std = float(np.std(usable)) + 0.1 * float(np.median(usable))

@@ -24,7 +24,6 @@ from pipeline.results import HardwareCheck, Record
 # ------------------------------------------------ a record, prepared for comparison with a chain
 
 _STILL = 0.02  # share of a signal's range by which it may vary and count as constant
-_MIN_STEP_SAMPLES = 10
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,7 +124,7 @@ class MeasuredRun:
             return None
         stop = int(edges[1]) if edges.size > 1 else signal.size
         window = slice(int(edges[0]), stop)
-        return window if window.stop - window.start >= _MIN_STEP_SAMPLES else None
+        return window if window.stop - window.start >= 10 else None
 
     def _ringing(self, x0: Array) -> Array:
         t = self.record.t

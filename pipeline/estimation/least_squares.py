@@ -65,7 +65,6 @@ def evaluated_once(at: Callable[[Array], T]) -> Callable[[Array], T]:
 # Reference: G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432, in Kaufman's form.
 
 PRECISION = 1e-8  # relative tolerance of the sum of squares, of p, and of the slope
-_APART = 1e3  # rounding errors by which columns differ that need no singular values
 _FOUND = (1, 2, 3, 4)  # MINPACK's codes for convergence
 
 
@@ -150,7 +149,8 @@ def solve_linear(y: Array, model: Callable[[Array], SeparableModel], p: Array) -
     basis, upper = np.linalg.qr(X)
     sizes = np.abs(np.diag(upper))
     least = np.finfo(np.float64).eps * len(X) * np.max(sizes)
-    if np.min(sizes) > _APART * least:
+    # Columns that differ by a thousand rounding errors need no singular values.
+    if np.min(sizes) > 1e3 * least:
         linear = solve_triangular(upper, y @ basis, check_finite=False)
     else:  # far from the solution, columns may be nearly equal; they then share their contribution
         basis, sizes, turn = np.linalg.svd(X, full_matrices=False)

@@ -101,10 +101,6 @@ def noise_beyond_rounding(rms: float, *, step: float) -> float:
     return float(np.sqrt(max(rms**2 - step**2 / 12, 0.0)))
 
 
-# Lags to use, as a share of the samples. At a rest after a step, residuals stay correlated.
-_LAGS_SHARE = 1 / 3
-
-
 def _parzen(x: Array) -> Array:
     """Return Parzen's window at lags x; the last lag is 1."""
     return np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * np.clip(1 - x, 0.0, None) ** 3)
@@ -166,7 +162,8 @@ def _tapered_correlation(residual: Array) -> Array:
     R = np.fft.rfft(residual, n_fft)
     correlation = np.fft.irfft(R.conj()[:, None] * R, n_fft)
     lags = np.arange(n_fft)
-    x = np.minimum(lags, n_fft - lags) / max(_LAGS_SHARE * n, 1.0)
+    # At a rest after a step, residuals stay correlated for up to a third of the samples.
+    x = np.minimum(lags, n_fft - lags) / max(n / 3, 1.0)
     return correlation * _parzen(x)
 
 

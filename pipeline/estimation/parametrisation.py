@@ -26,9 +26,6 @@ from pipeline.setup import Setup
 START_ZETA = 0.05  # of a single cart; typical of a cart on bearings
 ASSUMED_ZETA = 0.1  # of a resonance or a null; the usual guess in Throne's paper
 _FARTHEST = 100.0  # largest logarithm; a step that goes astray must not overflow
-# A fit must start from a possible chain. Springs or masses of a measured table that are below this
-# share of the largest one are raised to it.
-_SMALLEST_SHARE = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,7 +220,8 @@ def physical_start(found: Chain, *, bench: Setup, zeta: float = START_ZETA) -> C
 
 def _raised(values: Array) -> Array:
     """Return the values, with the smallest ones raised to a small share of the largest."""
-    return np.maximum(values, _SMALLEST_SHARE * np.max(np.abs(values)))
+    # A fit must start from a possible chain, so values below 2 % of the largest one are raised.
+    return np.maximum(values, 0.02 * np.max(np.abs(values)))
 
 
 def even_chain(values: Mapping[str, float], *, bench: Setup) -> Chain:
@@ -260,9 +258,6 @@ def even_chain(values: Mapping[str, float], *, bench: Setup) -> Chain:
 # scalar recursion at any sample times. All derivatives need only one more recursion for each mode
 # (the derivative with respect to lambda) and constant matrices.
 
-# Below this |lambda dt| the derivative of expm1(z)/z is computed from its series. Rounding would
-# cause an error of 1e-16/|z|; the error of the series is z²/8.
-_SMALL_EXPONENT = 1e-6
 # Poles closer than this (relative) make the Jacobian inaccurate, by the third power of their
 # distance. Additional damping on one cart, too little to show in a record, separates them. It moves
 # them apart by twice its square root.
@@ -370,7 +365,9 @@ def drive_modes(poles: ComplexArray, t: Array, u: Array) -> tuple[ComplexArray, 
     step = dt[:1] if is_even(t) else dt
     z = poles[:, None] * step
     growth = np.exp(z)
-    small = np.abs(z) < _SMALL_EXPONENT
+    # Below this |lambda dt| the derivative of expm1(z)/z is computed from its series. Rounding
+    # would cause an error of 1e-16/|z|; the error of the series is z²/8.
+    small = np.abs(z) < 1e-6
     safe = np.where(small, 1.0, z)
     gain = step * np.where(small, 1 + z / 2, np.expm1(z) / safe)
     d_gain = step**2 * np.where(small, 0.5 + z / 3, (safe * growth - np.expm1(z)) / safe**2)

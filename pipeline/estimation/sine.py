@@ -12,8 +12,6 @@ from pipeline.results import Record, SinePoint
 
 # ---------------------------------------------------------------------- independent columns
 
-_CLOSE = 1e-6  # error before the step of Newton's method, which squares it
-
 
 def inverse_of(columns: Array) -> Array:
     """Return the pseudo-inverse (p, n) of columns (n, p).
@@ -28,7 +26,8 @@ def inverse_of(columns: Array) -> Array:
         except np.linalg.LinAlgError:
             return np.linalg.pinv(columns).astype(np.float64)
         left = np.eye(len(inverse)) - inverse @ columns
-        if not np.max(np.abs(left)) < _CLOSE:
+        # The step of Newton's method squares the error.
+        if not np.max(np.abs(left)) < 1e-6:
             return np.linalg.pinv(columns).astype(np.float64)
     return inverse + left @ inverse
 
@@ -36,11 +35,7 @@ def inverse_of(columns: Array) -> Array:
 # ---------------------------------------------------------------------- the stage
 
 FEW_COUNTS = 20  # encoder steps; smaller amplitudes are known only to a few percent
-_WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # of a sliding window: cycles or s; the longer one counts
-_HOP_CYCLES, _HOP_TIME = 1.0, 0.2
 _LAST_WINDOWS = 4
-_PEAK_LINES = 4  # lines of the padded spectrum; a sine's frequency is no further from its peak
-_ITERATIONS = 20
 
 
 class _Part:
@@ -306,7 +301,7 @@ def _refined(t: Array, y: Array, *, omega: float) -> tuple[float, float]:
     half, angle = (t[-1] - t[0]) / 2, omega * (t[-1] - t[0]) / (t.size - 1)
     X = _columns(t, omega=omega)
     fit = _Sine(_Part(X, angle=angle), y)
-    for _ in range(_ITERATIONS):
+    for _ in range(20):
         # Change of the sine when omega changes by 1 rad at the ends of the record.
         turned = X[:, 3] * (fit.coefficients[0] * X[:, 1] - fit.coefficients[1] * X[:, 0])
         X = np.column_stack([_columns(t, omega=omega), turned])
@@ -358,7 +353,8 @@ def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]
     line = 2 * np.pi / (n * (grid[1] - grid[0]))
     peak = line * (1 + int(np.argmax(spectrum[1:])))
     fitted, std = _refined(t, u, omega=peak)
-    if abs(fitted - peak) > _PEAK_LINES * line:  # not a sine; the caller will notice
+    # The frequency of a sine is within four lines of the padded spectrum's peak.
+    if abs(fitted - peak) > 4 * line:  # not a sine; the caller will notice
         fitted = peak
     if stated is None:
         return fitted, ""
@@ -376,8 +372,9 @@ def _windows(t: Array, *, omega: float) -> list[tuple[int, int]]:
     """Return sliding windows [start, stop) over the record; the last one ends with it."""
     period = 2 * np.pi / omega
     duration = t[-1] - t[0]
-    length = max(_WINDOW_CYCLES * period, _WINDOW_TIME)
-    hop = max(_HOP_CYCLES * period, _HOP_TIME)
+    # A sliding window has three cycles or 0.6 s, whichever is longer.
+    length = max(3.0 * period, 0.6)
+    hop = max(period, 0.2)
     if length + (_LAST_WINDOWS - 1) * hop > duration:  # for a short record, single cycles
         length, hop = period, max(period / 2, (duration - period) / _LAST_WINDOWS)
     ends = t[-1] - hop * np.arange(int((duration - length) / hop + 1e-9) + 1)

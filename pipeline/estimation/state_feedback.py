@@ -207,7 +207,6 @@ _POINTS = 512  # points of a candidate's step; a power of two, because doubling 
 # Shares of the goal (settling time, overshoot) to aim at, the best first. The plant is known only
 # to a few percent, but should still meet the goal.
 _AIMS = ((0.8, 0.05), (0.8, 0.5), (1.0, 1.0))
-_HALVINGS = 6  # most halvings of a sample time that is too long
 _UNSEEN = 0.05  # percent; nobody notices a smaller overshoot
 
 _WEIGHTS = np.logspace(-3, 4, 25)  # weights of energies, from no visible feedback to a stiff loop
@@ -267,7 +266,7 @@ def _refuse_more_overshoot(plant: SampledPlant, task: Design, design: FeedbackDe
     most = float(simulate.overshoot_percent(alone, before=0.0, level=level))
     if design.overshoot_percent <= most:
         return
-    for halvings in range(1, _HALVINGS + 1):
+    for halvings in range(1, 7):
         sample_time = plant.sample_time / 2**halvings
         faster = SampledPlant(
             plant.chain, cart=plant.cart, settling=task.settling_time, sample_time=sample_time

@@ -18,9 +18,7 @@ _MOVED = 6.0  # grains; a smaller motion does not count
 # Largest residual and standard error of an extrapolated level, as shares of the motion.
 _EXTRAPOLATES = 0.02
 _STICKS_SIGMAS = 4.0  # standard errors; by chance, one edge in 16,000 is as far off
-_FLAT = 3.0  # grains; a window with a smaller range is level
 _ARITHMETIC = 1e-3  # scatter, in grains, of a level without noise or rounding
-_DRIFT_PASSES = 4
 _SAME_INPUT = 0.02  # share of the input's range
 
 
@@ -69,7 +67,7 @@ def fit_static_gain(record: Record, *, cart: int) -> StepGain:
         raise DataError(f"{record.id}: step gain needs motion, cart {cart} does not move")
     size = noise.resolution(t, y, step=step)
     found = [_settle(record, y, part, size=size, step=step) for part in parts]
-    for _ in range(_DRIFT_PASSES):  # without the drift, more samples count as settled
+    for _ in range(4):  # without the drift, more samples count as settled
         more = _drift(t, y, [p.level for p in found if p.level], size=size)
         if not more:
             break
@@ -159,7 +157,8 @@ def _settle(
 def _level(t: Array, y: Array, *, n_modes: int, size: float, step: float) -> _Level | None:
     """Return the level at which y (n,) settles; None if it does not settle."""
     motion, pace = float(np.ptp(y)), _pace(t, y, size=size)
-    flat = _flat_from(y, span=_FLAT * size)
+    # A window with a range of less than three grains is level.
+    flat = _flat_from(y, span=3.0 * size)
     if flat == 0 or t[-1] - t[flat] >= pace:
         return _mean_level(y, flat, step=step, arithmetic=_ARITHMETIC * size)
     ringing = _extrapolated(t, y, n_modes=n_modes, floor=size / np.sqrt(12))

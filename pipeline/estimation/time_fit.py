@@ -324,14 +324,6 @@ def _real_part(weights: ComplexArray, signals: ComplexArray) -> Array:
 # record.
 
 WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s; a bump should last about one period of the carts
-_HOP = 0.25  # distance of bumps over their width; they overlap, so closer bumps add little
-_MOST_BUMPS = 400  # bumps in a record; more would only take time
-_FEWEST_IN_BUMP = 8  # samples in a bump; fewer do not integrate φ'' well
-_FEWEST_PERIODS = 2  # periods of the slowest resonance to try, in the longest record
-_FEWEST_PER_PERIOD = 8  # samples in a period of the fastest resonance to try
-_FREQUENCY_STEP = 1.5  # frequency ratio of successive chains; the fit converges from a third away
-_SWING_OVER_GAIN = 1.6  # range of a lightly damped cart after a step, over its static change
-_SMALLEST_ZETA = 0.005  # least damping ratio, because noise may make a regressed damping negative
 
 
 def regress_chain(windows: Sequence[FitWindow], *, bench: Setup, width: float) -> Chain | None:
@@ -369,7 +361,8 @@ def regress_chain(windows: Sequence[FitWindow], *, bench: Setup, width: float) -
             return None
     start = physical_start(Chain(m=m, c=c, k=k), bench=bench)
     omega = np.maximum(start.omega_carts, 1 / width)
-    return Chain(m=start.m, c=np.maximum(c, 2 * _SMALLEST_ZETA * omega * start.m), k=start.k)
+    # Noise may make a regressed damping negative, so each cart has at least ζ = 0.005.
+    return Chain(m=start.m, c=np.maximum(c, 0.01 * omega * start.m), k=start.k)
 
 
 def _has_equation(window: FitWindow, cart: int, n: int) -> bool:
@@ -401,9 +394,11 @@ def _means(window: FitWindow, *, n: int, width: float) -> tuple[Array, Array] | 
     """
     t, duration = window.t, window.t[-1]
     samples = round(t.size * width / duration)
-    if duration < 2 * width or samples < _FEWEST_IN_BUMP:
+    # Fewer than eight samples do not integrate φ'' well.
+    if duration < 2 * width or samples < 8:
         return None
-    count = min(int((duration - width) / (_HOP * width)) + 1, _MOST_BUMPS)
+    # Bumps overlap by three quarters; closer or more than 400 bumps would only take time.
+    count = min(int((duration - width) / (0.25 * width)) + 1, 400)
     first = np.linspace(0, t.size - samples, count).astype(np.intp)
     x, force = np.zeros((3, n + 2, count)), np.zeros(count)
     x[:, window.carts] = Windows(t, first=first, width=samples).means(window.y)
@@ -424,15 +419,19 @@ def even_chains(windows: Sequence[FitWindow], *, bench: Setup) -> list[Chain]:
     # The input may be on from the first sample, so its range includes zero.
     ranges = [np.ptp(np.append(0.0, w.drive_u)) for w in driven if w.drive_u is not None]
     swing = np.median([np.ptp(w.y[0]) / u for w, u in zip(driven, ranges, strict=True)])
-    slowest = 2 * np.pi * _FEWEST_PERIODS / max(w.t[-1] for w in driven)
-    fastest = 2 * np.pi / (_FEWEST_PER_PERIOD * min(float(np.median(np.diff(w.t))) for w in driven))
+    # The longest record has two periods of the slowest resonance, and a period of the fastest one
+    # has eight samples.
+    slowest = 4 * np.pi / max(w.t[-1] for w in driven)
+    fastest = 2 * np.pi / (8 * min(float(np.median(np.diff(w.t))) for w in driven))
     if not swing > 0 or fastest <= slowest or not bench.tied:
         return []  # without a spring to a wall there is no static gain
     ratio = fastest / slowest
-    count = int(np.log(ratio) / np.log(_FREQUENCY_STEP)) + 1
+    # The fit converges from a third away.
+    count = int(np.log(ratio) / np.log(1.5)) + 1
     chains = []
     for omega in slowest * ratio ** (np.arange(count + 1) / count):
-        values = {"K_1": swing / _SWING_OVER_GAIN, "omega_a": omega}
+        # After a step, the range of a lightly damped cart is 1.6 times its static change.
+        values = {"K_1": swing / 1.6, "omega_a": omega}
         chains.append(even_chain(values, bench=bench))
     return chains
 
@@ -440,17 +439,8 @@ def even_chains(windows: Sequence[FitWindow], *, bench: Setup) -> list[Chain]:
 # Share of a record's power (about its mean) that a chain may leave unexplained. Carts with dry
 # friction leave some 2 %, a wrong chain most of it.
 FOLLOWED = 0.1
-# Farthest that a logarithm may move from its start. The logarithm of a damping or spring that does
-# not exist goes towards minus infinity. e^-15 of the start counts as zero, and no step overflows.
-_LOG_REACH = 15.0
 # Relative change of the cost at which a search ends. With n samples, 1/n is one standard error.
 _SEARCH_TOLERANCE = 1e-6
-_MOST_EVALUATIONS = 60
-# Largest number of comparisons of a chain with a record, in all starts together, at about 1 ms
-# each. With all carts measured, a search takes up to 200. With an unmeasured cart, it takes some
-# 3000 to reach the noise. If dry friction or backlash prevents this, all starts together take 5000.
-# Without this limit, records that no chain explains could take any number.
-_MOST_COMPARISONS = 10_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -528,7 +518,9 @@ def minimise_from(
     tolerance: float = _SEARCH_TOLERANCE,
 ) -> Attempt:
     """Minimise the sum of squared residuals, starting from theta, to a relative `tolerance`."""
-    reach = np.where(parametrisation.logarithmic, _LOG_REACH, np.inf)
+    # The logarithm of a damping or spring that does not exist goes towards minus infinity. e^-15 of
+    # the start counts as zero, and no step overflows.
+    reach = np.where(parametrisation.logarithmic, 15.0, np.inf)
     lower = np.maximum(parametrisation.bounds[0], theta - reach)
     upper = np.minimum(parametrisation.bounds[1], theta + reach)
 
@@ -542,7 +534,7 @@ def minimise_from(
         bounds=(lower, upper),
         scale="jac",
         tolerance=tolerance,
-        max_evaluations=_MOST_EVALUATIONS,
+        max_evaluations=60,
     )
     return replace(
         evaluate_chain(windows, parametrisation, solution.x),
@@ -591,7 +583,11 @@ def search(
     tried = comparisons = 0
     cut_short = False
     for theta in (*near, *even):
-        if cut_short := comparisons >= _MOST_COMPARISONS:
+        # A comparison of a chain with a record takes about 1 ms. With all carts measured, a search
+        # takes up to 200. With an unmeasured cart, it takes some 3000 to reach the noise, or 5000
+        # if dry friction or backlash prevents this. Records that no chain explains could take any
+        # number.
+        if cut_short := comparisons >= 10_000:
             break
         found = minimise_from(windows, parametrisation, theta)
         tried, comparisons = tried + 1, comparisons + found.n_evaluations * len(windows)

@@ -47,10 +47,6 @@ from pipeline.results import Finding, Record, StepGain
 # share of the record afterwards. It is a fault if the identified carts meanwhile move by this many
 # encoder steps and by three tenths of their motion. A delay or play holds a cart only briefly.
 _STILL, _SEEN_COUNTS = 0.2, 5.0
-# Least ratio of the mean square change from sample to sample to twice the variance. It is 1 for
-# noise. A motion with this ratio has a period of at most five samples. (J. von Neumann, Annals of
-# Mathematical Statistics 12, 1941.)
-_WHITE = 0.8
 _FEWEST_CYCLES = 1.5  # cycles of a dwell; with fewer there is no steady state at any damping
 
 
@@ -224,7 +220,9 @@ def _is_noise(record: Record, cart: int) -> bool:
     """Return whether the reading of a cart changes from sample to sample like noise."""
     y = record.position(cart)
     change = float(np.mean(np.diff(y) ** 2))
-    return change > 0 and change >= 2 * _WHITE * float(np.var(y))
+    # For noise, the mean square change is twice the variance. A motion with 0.8 of this has a
+    # period of at most five samples (J. von Neumann, Annals of Mathematical Statistics 12, 1941).
+    return change > 0 and change >= 1.6 * float(np.var(y))
 
 
 def _edges(y: np.ndarray) -> np.ndarray:

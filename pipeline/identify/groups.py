@@ -51,19 +51,10 @@ from pipeline.setup import Setup
 from pipeline.submission.models import is_named
 from pipeline.words.numbers import first_few, join_names, listing, with_error
 
-# Relative difference of a mass or spring that matters, and of a frequency, its square root.
-_DIFFERENT, _DETUNED = 0.05, 0.025
 _MOST_SEEDS = 8  # recordings from which a group is started
 _MOST_FAILED = 2  # recordings that no chain explains; after these, the carts are not linear
 _MOST_GROUPS = 3
-_ENOUGH = 0.9  # share of the driven recordings that must be in a group
 _FARTHER = 1.5  # times the motion of another group
-_MOST_DWELLS = 8  # dwells that are fitted if a group has no other recordings
-_FEW_SAMPLES = 150  # samples of a recording from which the carts of a set-up are found
-# Ratio of the largest and smallest motion per input of steps from which set-ups are searched for
-# before the fit. Dry friction and play change a gain by less.
-_OTHER_GAIN = 1.6
-_MOST_ASTRAY = 0.25  # share of the recordings that may follow none of the set-ups
 _CONTRARY = 0.3  # share of the motion that the carts of another set-up leave unexplained
 _SAME_INPUT = 0.95  # share of another input's range that an equally large input reaches
 # A date in the name of a file or folder, or the day of a time stamp.
@@ -117,7 +108,8 @@ def _driven_groups(
             break
         groups.append((members, own))
         rest = [record for record in rest if record not in members]
-    most = len(rest) <= (1 - _ENOUGH) * len(driven)
+    # Nine tenths of the driven recordings must be in a group.
+    most = len(rest) <= (1 - 0.9) * len(driven)
     return groups if most and _overlap([members for members, _ in groups]) else []
 
 
@@ -131,11 +123,12 @@ def _against_decays(
     """
     gains = [row.consistent for row in rows if read_name(row.name).is_gain]
     bent = {d.experiment for d in decays if not d.law.is_exponential}
+    # A frequency must differ by 2.5 %, as with a mass or spring that differs by 5 %.
     pairs = {
         row.name: (row.initial, row.final)
         for row in rows
         if read_name(row.name).is_frequency
-        if abs(row.change_percent or 0.0) > 100 * _DETUNED
+        if abs(row.change_percent or 0.0) > 2.5
         if row.change_sigmas is not None and row.change_sigmas > SIGMA_LIMIT
         if row.initial and row.initial.source == "log_decrement" and row.final
         if not bent & set(row.initial.experiments)
@@ -213,7 +206,8 @@ def _follows(record: Record, fit: ChainFit) -> bool:
 
 def _fit(members: Sequence[Record], *, bench: Setup) -> ChainFit | None:
     whole = [record for record in members if record.kind != "sine"]
-    dwells = members[:: 1 + len(members) // _MOST_DWELLS]
+    # Eight dwells are enough if a group has no other recordings.
+    dwells = members[:: 1 + len(members) // 8]
     try:
         return fit_records(whole or dwells, bench=bench)
     except DataError:
@@ -242,7 +236,7 @@ def _described(groups: Sequence[tuple[Sequence[Record], ChainFit]]) -> tuple[Rec
         for name in known
         for one, fit in zip(values[1:], fits[1:], strict=True)
         if abs(one[name] - first[name])
-        > max(SIGMA_LIMIT * np.hypot(fit.std[name], std[name]), _DIFFERENT * abs(first[name]))
+        > max(SIGMA_LIMIT * np.hypot(fit.std[name], std[name]), 0.05 * abs(first[name]))
     )
     if not different:
         return ()
@@ -299,7 +293,8 @@ def find_setups(driven: Sequence[Record], *, bench: Setup) -> tuple[RecordingGro
         return ()
     names = [{record.id for record in one.members} for one in setups]
     others = tuple(one.id for one in driven if not any(one.id in own for own in names))
-    if len(others) > _MOST_ASTRAY * len(driven):
+    # A quarter of the recordings may follow none of the set-ups.
+    if len(others) > 0.25 * len(driven):
         return ()
     values = _setup_values([one.chain for one in setups])
     groups = [
@@ -323,7 +318,8 @@ def steps_disagree(driven: Sequence[Record]) -> bool:
     """Return whether carts move much farther in some steps than in others, or only in some."""
     steps = [record for record in driven if record.kind == "step" and is_driven(record)]
     ratios = [np.ptp(r.position(1)) / np.ptp(r.u) for r in steps if r.u is not None]
-    apart = len(ratios) > 3 and max(ratios) > _OTHER_GAIN * min(ratios)
+    # Dry friction and play change a gain by less than this factor.
+    apart = len(ratios) > 3 and max(ratios) > 1.6 * min(ratios)
     return bool(apart) or len({_seems_held(record) for record in steps}) > 1
 
 
@@ -401,7 +397,7 @@ def _quick_chain(record: Record, *, bench: Setup) -> Chain | None:
     parametrisation = Parametrisation(bench=bench)
     try:
         window = open_window(record)
-        few = window.thinned(_FEW_SAMPLES)
+        few = window.thinned(150)
     except DataError:  # nothing moves
         return None
     regressed = [regress_chain([window], bench=bench, width=width) for width in WIDTHS]

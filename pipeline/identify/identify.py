@@ -57,7 +57,6 @@ from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress
 
 _WORDS = phrases("skipped")
-_ROUNDS = 4  # In each round, the used records may show that others are wrong
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -341,7 +340,8 @@ def identify_with_rejection(
     again = partial(identify, data, interventions=interventions, bench=bench, progress=progress)
     again = partial(again, measured={})
     found = again(without=without)
-    for _ in range(_ROUNDS):
+    # In each round, the used records may show that others are wrong.
+    for _ in range(4):
         # If too few records remain to identify the carts, the earlier result is kept.
         chain, fits = _reference_chain(found, data, bench=bench) or (chain, fits)
         faults = find_faults(data.records, chain=chain, fits=fits)

@@ -55,7 +55,6 @@ _LAWS = phrases("decays")
 # Largest difference between the polynomials of two loops that count as the same. Rounding leaves
 # 1e-13 on realistic plants, and gains from another program up to 1e-8.
 _SAME_LOOP = 1e-6
-_LAST_DIGIT = 12  # decimals; rounding beyond them depends on the linear algebra library
 
 
 def check_carts(
@@ -512,7 +511,8 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
     except (np.linalg.LinAlgError, ValueError, ZeroDivisionError):
         message = "not verified: the plant's numbers differ too much in size"
         return replace(verified, outcome="skip", message=message)
-    value = float(np.max(np.append(np.abs(ours - wanted), abs(level - 1))).round(_LAST_DIGIT))
+    # Rounding beyond twelve decimals depends on the linear algebra library.
+    value = float(np.max(np.append(np.abs(ours - wanted), abs(level - 1))).round(12))
     if value <= _SAME_LOOP:
         return replace(verified, value=value)
     finite = bool(np.isfinite(value))

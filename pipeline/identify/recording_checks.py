@@ -49,14 +49,10 @@ _LEAST_SHARE = 0.2
 # Share of the free carts' swing. A cart that is held firmly moves less.
 _HELD_FIRMLY = 0.05
 _LONGEST = 3.0  # metres; no bench has a longer track
-_LONGEST_SLOW = 20.0  # metres; the limit if nothing moves faster than a person runs
 # Metres per second, faster than a person runs. Carts of a bench reach 0.4, those of inverted
 # pendulums 3. Centimetres read as metres give 15 to 40.
 _FASTEST = 10.0
-_LONGEST_WHOLE = 0.5  # metres; the limit if all readings are whole numbers, as counts are
 _ECP_STEP = 2.27e-5  # metres per count of the encoders of an ECP 210
-_LARGEST = 100.0  # volts; no amplifier at a bench gives as much
-_ECP_LARGEST = 10.5  # volts; the converter of an ECP 210 gives 10, and files round
 # Volts. A converter of 16 bits and ± 10 V has steps of 0.3 mV.
 _LEAST = 1e-3
 _LATE, _SURE = 2.0, 4.0  # samples, and standard errors: a late channel exceeds both
@@ -66,7 +62,6 @@ _LATE, _SURE = 2.0, 4.0  # samples, and standard errors: a late channel exceeds 
 # and thousands of times without friction.
 _BETTER = 5.0
 
-_SPELT_OUT = 3  # up to so many records are listed by name, even if they are a whole kind
 _PLURAL = {"sine": "dwells", "step": "steps", "decay": "decays", "sweep": "sweeps"}
 # Relative difference between a stated frequency and that of the input. A larger one means that the
 # file belongs to another run.
@@ -130,8 +125,10 @@ def _find_other_scales(records: Sequence[Record], *, bench: Setup) -> list[Findi
     travel, run = _reached((r, float(np.ptp(r.y, axis=1).max())) for r in records)
     whole = all(np.array_equal(record.y, np.round(record.y)) for record in records)
     speeds = [np.abs(np.diff(r.y) / np.diff(r.t)).max(initial=0.0) for r in records]
-    longest = _LONGEST_SLOW if max(speeds, default=0.0) * (metres or 0.0) < _FASTEST else _LONGEST
-    if metres and travel > (limit := (_LONGEST_WHOLE if whole else longest) / metres):
+    # If nothing moves faster than a person runs, a track may have 20 m.
+    longest = 20.0 if max(speeds, default=0.0) * (metres or 0.0) < _FASTEST else _LONGEST
+    # If all readings are whole numbers, as counts are, carts move by at most half a metre.
+    if metres and travel > (limit := (0.5 if whole else longest) / metres):
         why = say("position_scale_whole" if whole else "position_scale_long")
         details = {"reach": f"{travel:.4g}", "unit": unit, "quoted": repr(unit), "why": why}
         found.append(_scale("position_scale", run, details=details, value=travel, limit=limit))
@@ -143,9 +140,11 @@ def _find_other_scales(records: Sequence[Record], *, bench: Setup) -> list[Findi
     headed = any(one.role == "input" for record in records for one in record.heading_units)
     if not (volts and driven):
         return found
-    most, why = _LARGEST, "input_scale_large"
+    # No amplifier at a bench gives 100 V.
+    most, why = 100.0, "input_scale_large"
     if not headed and _is_ecp(records, bench=bench):
-        most, why = _ECP_LARGEST, "input_scale_ecp"
+        # The converter of an ECP 210 gives 10 V, and files round.
+        most, why = 10.5, "input_scale_ecp"
     beyond = largest * volts / most
     if not headed and max(size for _, size in driven) * volts < _LEAST:
         beyond, why = _LEAST / (largest * volts), "input_scale_small"
@@ -576,7 +575,8 @@ def _named(names: Sequence[str], records: Sequence[Record]) -> str:
     parts: list[str] = []
     for kind, alike in by_kind(records).items():
         of_kind = [record.id for record in alike if record.id in names]
-        whole = len(of_kind) == len(alike) > _SPELT_OUT
+        # Up to three records are listed by name, even if they are a whole kind.
+        whole = len(of_kind) == len(alike) > 3
         parts += [f"all {len(alike)} {_PLURAL.get(kind, kind)}"] if whole else of_kind
     return ", ".join(parts)
 

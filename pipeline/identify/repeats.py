@@ -18,14 +18,11 @@ from pipeline.identify.findings import SAME_SIZE, SIGMAS, explain_ratio, say
 from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.results import Check, Estimate, Finding, LogDecrement, Record, StepGain
 
-_MATERIAL = 0.05  # share of the response; a smaller difference does not matter
 # A repeat is odd if it differs from the others by this many times their spread; the keys are
 # numbers of repeats. If repeats differ by normally distributed multiples of one shape, 5 % of the
 # sets are flagged by chance; if they differ in several ways, far fewer are. With three repeats, the
 # spread comes from a single difference, so the factor is large.
 _SPREADS, _SPREADS_OF_MANY = {3: 30.0, 4: 8.0}, 5.0
-_AMPLIFICATION = 2.0  # factor by which a lightly damped chain amplifies a difference of the inputs
-_START_SAMPLES = 3  # samples whose median is the start, so that a spike is ignored
 _SAME_RUN = 0.05  # relative; two runs may differ by this even if a known mistake is corrected
 _LIKE_THE_FIT = 0.15  # relative; the usual difference of initial and final estimates (Throne 2005)
 # Factors by which friction, play or a soft hold may change a gain or a frequency.
@@ -115,11 +112,13 @@ def _differences(group: Sequence[Record]) -> tuple[Array, Array]:
     t = _common_times(*group)
     u = np.concatenate([_at(t, record, _excitation(record)) for record in group])  # (n, n_t)
     y = np.stack([_at(t, record, record.y) for record in group])  # (n, p, n_t)
-    y = y - np.median(y[:, :, :_START_SAMPLES], axis=2, keepdims=True)
+    # The start is the median of three samples, so that a spike is ignored.
+    y = y - np.median(y[:, :, :3], axis=2, keepdims=True)
     # The differences of all pairs at once would need gigabytes for a hundred repeats.
     by_input = np.sqrt([np.mean((one - u) ** 2, axis=1) for one in u]) / _rms(u)
     differences = np.sqrt([np.mean((one - y) ** 2, axis=(1, 2)) for one in y])
-    return differences, (_MATERIAL + _AMPLIFICATION * by_input) * _rms(y)
+    # A difference of 5 % does not matter, and a lightly damped chain doubles that of the inputs.
+    return differences, (0.05 + 2.0 * by_input) * _rms(y)
 
 
 def _farthest(

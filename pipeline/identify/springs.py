@@ -42,9 +42,6 @@ from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME, spring_names
 from pipeline.words.numbers import listing, significant
 
-# A missing spring leaves a χ² that is larger by this factor. Friction or a stiffening spring is not
-# explained by another linear spring.
-_MUCH_BETTER = 100.0
 # On a bench, a spring is at least a tenth as stiff as the one before it.
 _NO_SPRING = 0.1
 
@@ -273,7 +270,9 @@ def _better_springs(
     except DataError:
         return None
     before = _misfit(fit, responses, bench=bench)
-    if not other.converged or (before and other.chi_square_per_dof > before / _MUCH_BETTER):
+    # A missing spring leaves a χ² that is a hundred times larger. Friction or a stiffening spring
+    # is not explained by another linear spring.
+    if not other.converged or (before and other.chi_square_per_dof > before / 100.0):
         return None
     k, std, largest = other.chain.k, other.std, float(np.max(other.chain.k))
     found = [

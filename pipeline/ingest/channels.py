@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array, true_runs
 from pipeline.ingest.table import Note
 
-_FEWEST_COUNTS = 100  # a set point in counts
 _MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over its travel
 
 
@@ -55,7 +54,8 @@ def settles_at_input(u: Array, x: Array) -> bool:
     rest, moved = pieces[0], max(pieces[1:], key=lambda piece: abs(u[piece[0]] - u[0]) * piece.size)
     step = float(u[moved[0]] - u[0])
     settled = float(np.mean(x[moved[-(moved.size // 4 + 1) :]]) - np.median(x[rest]))
-    return abs(step) >= _FEWEST_COUNTS and abs(abs(settled / step) - 1) < 0.03
+    # A set point in counts is at least 100.
+    return abs(step) >= 100 and abs(abs(settled / step) - 1) < 0.03
 
 
 def _are_counts(x: Array) -> bool:

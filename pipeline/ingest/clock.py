@@ -17,7 +17,6 @@ FEWEST_SAMPLES = 8  # fewest samples for any estimate
 _GAP = 4.0  # time is missing if an interval is this many times the usual one
 # Largest distance of a stamp from its line, in rounding steps: half a step, plus the fit's error.
 _ROUNDING_BAND = 0.65
-_REPEATS = 0.05  # share of stamps that repeat if a sample is shorter than their rounding
 # Ranges of clocks in s: 32 or 16 bits of µs or ms, or of the file's unit; a day; half a day.
 _RANGES = (2**32 * 1e-6, 2**32 * 1e-3, 2**16 * 1e-3, 2**16 * 1e-6, 2**32, 2**16, 86_400, 43_200)
 
@@ -220,7 +219,8 @@ def _steady(stamps: Array, rounding: float) -> tuple[Array, int]:
     bounds = [0, *_pauses(stamps, rounding).tolist(), stamps.size]
     pieces = [stamps[a:b] for a, b in pairwise(bounds)]
     repeats = np.mean(np.diff(stamps) == 0) if (np.diff(stamps) >= 0).all() else 0.0
-    if repeats < _REPEATS or min(piece.size for piece in pieces) < FEWEST_SAMPLES:
+    # If a sample is shorter than the rounding, at least one stamp in twenty repeats.
+    if repeats < 0.05 or min(piece.size for piece in pieces) < FEWEST_SAMPLES:
         return stamps, 0
     moments = [(_centred(piece.size), piece) for piece in pieces]
     slope = float(sum(i @ p for i, p in moments) / sum(i @ i for i, _ in moments))

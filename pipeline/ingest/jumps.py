@@ -18,14 +18,9 @@ from pipeline.ingest.table import FEW_NAMED, Note
 from pipeline.words.numbers import first_few
 
 _SIDE = 8  # samples on each side of a step
-_FARTHER = 4.0  # times as far as any step beside it
 _STEPS = 12.0  # encoder steps, or times the noise; a smaller jump does no harm
-_LEAST = 0.02  # share of the range
-_MOST_BAD = 12  # readings in a row that a spike lasts
-_MOST_SHARE = 0.05  # share of readings that may be wrong
 _BITS = (8, 10, 12, 14, 16, 20, 24, 32)
 _ANGLES = {"rad": 2 * np.pi, "deg": 360.0, "rev": 1.0}  # one turn
-_FEWEST_CHANGES = 20
 
 _Rows = NDArray[np.intp]
 _Mask = NDArray[np.bool_]
@@ -136,14 +131,16 @@ def _jumps(x: Array, *, spare: int = 0) -> _Rows:
     `spare` is how many of the steps on each side may be jumps, too.
     """
     moves = np.abs(np.diff(x))
-    least = max(_LEAST * float(np.ptp(x)), _STEPS * float(np.median(moves)))
+    # A jump is at least 2 % of the range.
+    least = max(0.02 * float(np.ptp(x)), _STEPS * float(np.median(moves)))
     rows = np.flatnonzero(moves > least)
     padded = np.pad(moves, _SIDE, constant_values=-1.0)
     before, after = (
         np.sort(padded[rows[:, None] + np.arange(_SIDE) + shift], axis=1)[:, -1 - spare]
         for shift in (0, _SIDE + 1)
     )
-    is_far = (moves[rows] > _FARTHER * np.maximum(before, after)) & (np.minimum(before, after) >= 0)
+    # A jump is four times as far as any step beside it.
+    is_far = (moves[rows] > 4.0 * np.maximum(before, after)) & (np.minimum(before, after) >= 0)
     rows, after = rows[is_far], after[is_far]
     if not rows.size:
         return rows
@@ -177,9 +174,11 @@ def _wrong(x: Array) -> _Mask:
     wrong = np.zeros(x.size, dtype=np.bool_)
     for start, end in pairwise(jumps):
         there, back = x[start] - x[start - 1], x[end] - x[end - 1]
-        if end - start <= _MOST_BAD and abs(there + back) < 0.5 * min(abs(there), abs(back)):
+        # A spike lasts at most twelve readings.
+        if end - start <= 12 and abs(there + back) < 0.5 * min(abs(there), abs(back)):
             wrong[start:end] = not wrong[start - 1]
-    return wrong if wrong.mean() <= _MOST_SHARE else np.zeros_like(wrong)
+    # At most one reading in twenty may be wrong.
+    return wrong if wrong.mean() <= 0.05 else np.zeros_like(wrong)
 
 
 def _held(x: Array) -> _Mask | None:
@@ -187,7 +186,7 @@ def _held(x: Array) -> _Mask | None:
     starts = np.flatnonzero(np.diff(x) != 0) + 1
     lengths = np.diff(starts)
     # More than half of the readings last three samples or longer.
-    if starts.size < _FEWEST_CHANGES or (n := float(np.median(lengths))) < 3:
+    if starts.size < 20 or (n := float(np.median(lengths))) < 3:
         return None
     times = np.maximum(np.round(lengths / n), 1)
     single = times == 1

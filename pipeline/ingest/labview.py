@@ -211,7 +211,6 @@ def _headings(segment: _Segment, names: Sequence[str]) -> list[str]:
 # -------------------------------------------------------------------------------------------- .tdms
 
 _LEAD_IN = 28  # bytes
-_BIG_ENDIAN = 0x40  # flag of a segment
 
 
 def is_tdms(raw: bytes) -> bool:
@@ -297,7 +296,8 @@ def _refuse_cut(raw: bytes, *, source: str) -> None:
     while at < len(raw):
         if raw[at : at + 4] != b"TDSm" or at + _LEAD_IN > len(raw):
             raise SubmissionError(f"{source}: broken at byte {at:,}, where a segment should begin")
-        order = ">" if raw[at + 4] & _BIG_ENDIAN else "<"
+        # This flag of a segment means big-endian.
+        order = ">" if raw[at + 4] & 0x40 else "<"
         (length,) = struct.unpack_from(f"{order}Q", raw, at + 12)
         end = at + _LEAD_IN + length
         if end > len(raw):  # also true if LabVIEW never wrote the length

@@ -32,7 +32,6 @@ from pipeline.submission.load import NAME
 from pipeline.words.numbers import count, first_few, listing
 
 _FEW_COUNTS = 10  # counts; no motor moves with so few, so smaller whole numbers are volts
-_MOST_NAMES = 12  # columns named in a warning
 DUTY_COUNT = 5 / 4096  # V; the amplifier of the UCSD bench gives 5 V for 4096 counts
 _NEED_INPUT = ("step", "sine", "sweep")
 
@@ -157,7 +156,7 @@ def _misnamed_columns(system: System, tables: Sequence[FileTable]) -> str:
         close = get_close_matches(column, names, n=1) if isinstance(column, str) else []
         meant = f" (did you mean {close[0]!r}?)" if close else ""
         stated.append(f"{role} = {column!r}{meant}")
-    there = f"the files have at most {count(most, 'column')}: {first_few(names, _MOST_NAMES)}"
+    there = f"the files have at most {count(most, 'column')}: {first_few(names, 12)}"
     is_in = "is in no file" if len(wrong) == 1 else "are in no file"
     said = f"{NAME}: [system] columns: {listing(stated)} {is_in}; {there}"
     return Note(said, "no_column", about=", ".join(wrong))

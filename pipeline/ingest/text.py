@@ -34,8 +34,6 @@ _FEW_LINES, _SNIFFED_LINES = 40, 400
 _LONG = 8  # similar rows that begin a table; a shorter table must be alone in its file
 _BEST = 1.5 * _LONG  # score of a layout in which every field is a plain number
 _WORST = 0.01  # largest share of rows that may be skipped
-_SPARSE = 0.1  # share of missing values from which a column is left out
-_DATED = 1e6  # s; a time of day is less, the time since 1900 is more
 # The names in an ECP heading consist of words with single spaces between them.
 _HEADING_WORDS = re.compile(
     r"encoder\s*\d+\s+(?:pos|vel|acc)\w*|commanded\s+\w+|control\s+effort|"
@@ -509,7 +507,8 @@ def _mend(
     for j in range(width) if kept else ():
         name, share = _named(names, j), good[:, j].mean()
         last = int(np.flatnonzero(good[:, j])[-1]) + 1 if share else 0
-        if share >= 1 - _SPARSE and last >= min((1 - _WORST) * len(kept), len(kept) - 1):
+        # A column with more than a tenth of its values missing is left out.
+        if share >= 0.9 and last >= min((1 - _WORST) * len(kept), len(kept) - 1):
             used.append(j)
         elif share > 0.2:
             said = f"{name!r} has {good[:, j].sum():,} of {len(kept):,} values"
@@ -530,7 +529,8 @@ def _mend(
             texts[times[:, j], j], table[times[:, j], j] = True, np.nan
         elif timed:
             first = table[kept, j][np.isfinite(table[kept, j])][0]
-            if first > _DATED:  # a date: rounded, because doubles keep a date to 1e-6 s
+            # A time of day is less than 1e6 s, the time since 1900 is more.
+            if first > 1e6:  # a date: rounded, because doubles keep a date to 1e-6 s
                 table[:, j] = np.round(table[:, j] - first, 5)
             names[j] = f"{parse_heading(names[j]).name} [s]"
     for i in kept:

@@ -19,18 +19,8 @@ from pipeline.submission.models import MOST_CARTS
 
 # Change between two samples, as a share of the column's range; no cart moves so fast.
 _JUMP = 0.2
-# least share of samples at which time advances, because a clock may have rounded stamps
-_ADVANCES = 0.2
-_EQUAL = 0.05  # largest relative rms difference of a position and its reference
-_ALIKE = 0.999  # correlation of one signal in two units
 _FASTEST = 1e-5  # s between samples; no bench records faster
 _CLEARER = 0.5  # ratio of the unexplained shares of acceleration, best input to next best
-# Unexplained share of acceleration. It is smaller for columns that an input moves.
-_FOLLOWS = 0.5
-_PURER = 0.1  # ratio of the parts of the curvature that are not a sine, purest column to next
-# Unexplained share of acceleration. It is smaller for carts in free motion.
-_FREE = 0.1
-_WINDOW = 0.4  # length of a window, as a share of the fastest period
 _FEWEST, _MOST_WINDOWS = 9, 4000
 
 
@@ -70,10 +60,11 @@ def _find_roles(table: FileTable) -> Roles:
     positions = [i for i in signals if i not in (drive, reference)]
     if not 0 < len(positions) <= MOST_CARTS:
         return Roles()
+    # A position and its reference may be equal to 5 %.
     doubts += [
         f"the columns {i + 1} and {j + 1} are nearly equal: is one of them the reference?"
         for i, j in combinations(signals, 2)
-        if np.std(values[i] - values[j]) < _EQUAL * np.std(values[i])
+        if np.std(values[i] - values[j]) < 0.05 * np.std(values[i])
     ][:1]
     roles = {"time": time, "input": drive, "reference": reference}
     roles |= {f"x{cart}": i for cart, i in enumerate(positions, start=1)}
@@ -86,7 +77,8 @@ def _find_roles(table: FileTable) -> Roles:
 
 def _is_clock(values: Array) -> bool:
     steps = np.diff(values)
-    if values.size < 3 or (steps < 0).any() or np.count_nonzero(steps) < _ADVANCES * steps.size:
+    # A clock may have rounded stamps, so time need not advance at every sample.
+    if values.size < 3 or (steps < 0).any() or np.count_nonzero(steps) < 0.2 * steps.size:
         return False
     clock = read_clock(values)
     regular = bool(clock.jitter < clock.mean_interval)
@@ -204,13 +196,15 @@ def _by_law(
     """
     if not left:
         return None
-    if left[None] < _FREE:  # no input is needed, or all columns are sines
+    # In free motion, less than a tenth of the acceleration is unexplained.
+    if left[None] < 0.1:  # no input is needed, or all columns are sines
         if _dies_away(values[list(signals)]):
             return None, None
         pure = _purest(values, signals)
         return None if pure is None else (pure, None)
     best, second = sorted(signals, key=lambda i: left[i])[:2]
-    clear = left[best] < min(_FOLLOWS, _CLEARER * left[second], _CLEARER * left[None])
+    # Of columns that an input moves, less than half of the acceleration is unexplained.
+    clear = left[best] < min(0.5, _CLEARER * left[second], _CLEARER * left[None])
     step = encoder_step(values[best])
     steps = [encoder_step(values[i]) for i in signals if i != best]
     same = any(step > 0 and abs(other - step) < 0.01 * step for other in steps)
@@ -218,7 +212,8 @@ def _by_law(
 
 
 def _is_alike(values: Array, i: int, j: int) -> bool:
-    return bool(abs(np.corrcoef(values[i], values[j])[0, 1]) > _ALIKE)
+    # This is the correlation of one signal in two units.
+    return bool(abs(np.corrcoef(values[i], values[j])[0, 1]) > 0.999)
 
 
 def _averages(values: Array, signals: Sequence[int]) -> Array | None:
@@ -227,7 +222,8 @@ def _averages(values: Array, signals: Sequence[int]) -> Array | None:
     if not signals:
         return None
     period = min(motion_period(values[i]) for i in signals)
-    width = max(round(_WINDOW * period), _FEWEST)
+    # A window has 0.4 of the fastest period.
+    width = max(round(0.4 * period), _FEWEST)
     if n < 8 * width:
         width = max(n // 8, _FEWEST)
     if n < 4 * width:
@@ -271,7 +267,8 @@ def _purest(values: Array, signals: Sequence[int]) -> int | None:
         law, *_ = np.linalg.lstsq(known, wanted, rcond=None)
         left[i] = float(((wanted - known @ law) ** 2).sum() / (wanted**2).sum())
     best, second = sorted(left, key=lambda i: left[i])[:2]
-    return best if left[best] < _PURER * left[second] else None
+    # What is not a sine must be a tenth of that of the next column.
+    return best if left[best] < 0.1 * left[second] else None
 
 
 def _dies_away(rows: Array) -> bool:

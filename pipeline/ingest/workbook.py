@@ -17,7 +17,6 @@ _FORMAT = Format(title="Excel workbook")
 _PARTS = (b"[Content_Types].xml", b"docProps/", b"xl/")  # one of these occurs early in the archive
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(e[-+]?\d+)?", re.IGNORECASE)
 _FORMULA = re.compile(rb"<(?:\w+:)?f[ >]")
-_FIRST_ROWS = 40  # rows that show how the numbers of a column are formatted
 
 
 def is_workbook(raw: bytes) -> bool:
@@ -92,9 +91,10 @@ def _sheets(
                         rows[i] = tuple(
                             _Formula(b) if a is None and b is not None else a for a, b in pairs
                         )
+            # Forty rows show how the numbers of a column are formatted.
             percent = {
                 cell.column_letter
-                for row in sheet.iter_rows(max_row=_FIRST_ROWS)
+                for row in sheet.iter_rows(max_row=40)
                 for cell in row
                 if cell.value is not None and str(cell.number_format).endswith("%")
             }
