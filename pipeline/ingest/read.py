@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Literal
 
@@ -103,7 +103,7 @@ def read_data(submission: Submission) -> Ingested:
                 warnings += _read_bode(table, experiment, points)
                 tables_read.append(experiment.id)
             else:
-                records.append(_read_record(_open(table, experiment, system)))
+                records.append(_Reading(table, experiment, system).record())
     misnamed = _misnamed_columns(system, [table for read, _ in tables.values() for table in read])
     if len(unreadable) == len(experiments):
         (name, reason), *others = unreadable.items()
@@ -182,118 +182,6 @@ def _read_bode(table: FileTable, experiment: Experiment, points: Points) -> list
 # ------------------------------------------------------------------------------ one record
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Opened:
-    """A file with its columns identified; `positions` by cart.
-
-    Reading the file adds its notes to `notes` and the units of its headings to `headed`.
-    """
-
-    system: System
-    table: FileTable
-    experiment: Experiment
-    columns: dict[str, Column]
-    positions: list[Column]
-    clock: Clock
-    notes: list[str]
-    headed: list[HeadingUnit] = field(default_factory=list)
-
-
-def _open(table: FileTable, experiment: Experiment, system: System) -> _Opened:
-    own, free = experiment.columns or {}, experiment.carts
-    shared = {
-        role: column
-        for role, column in system.columns.items()
-        if table.has(column) and column not in own.values()
-    }
-    columns, unused = assign_columns(table, explicit=shared | own, free=free)
-    # A column that the experiment needs may not have empty or broken cells.
-    left_out = replace(table, names=tuple(table.partial), values=np.zeros((len(table.partial), 1)))
-    needed = {"time", *(f"x{cart}" for cart in free)} - columns.keys()
-    needed |= {"input"} - columns.keys() if experiment.kind in _NEED_INPUT else set()
-    partial, _ = assign_columns(left_out, explicit=None, free=free)
-    table.refuse_partial(column.name for role, column in partial.items() if role in needed)
-    measured = {c.cart: c for role, c in columns.items() if role[0] == "x"}
-    positions = [measured[cart] for cart in sorted(measured) if cart <= system.carts]
-    if not positions:
-        raise SubmissionError(
-            f"{table.source}: no column is a cart's position; it has {table.headings()}; "
-            f'say which: columns = {{ time = "…", input = "…", x{free[0]} = "…" }}'
-        )
-    if not {column.cart for column in positions} & set(free):
-        raise SubmissionError(
-            f"{table.source}: the free carts are {list(free)}, but the file measures "
-            f"{[column.cart for column in positions]}; check `carts` and `file`"
-        )
-    notes, extra = list(table.notes), [c.name for c in measured.values() if c not in positions]
-    if unused or extra:
-        names = ", ".join([*unused, *extra])
-        notes.append(Note(f"columns not used: {names}", "unused", about=names))
-    stamps = time_stamps(table, columns.get("time"), sample_rate=experiment.sample_rate)
-    return _Opened(
-        system=system,
-        table=table,
-        experiment=experiment,
-        columns=columns,
-        positions=positions,
-        clock=read_clock(stamps),
-        notes=notes,
-    )
-
-
-def _read_record(opened: _Opened) -> Record:
-    """Return the record with the input's scale applied, but without an unknown sign."""
-    table, experiment, columns = opened.table, opened.experiment, opened.columns
-    positions, notes, clock = opened.positions, opened.notes, opened.clock
-    t = clock.t
-    if (time := columns.get("time")) is not None:
-        notes += clock_notes(table, time, clock, sample_rate=experiment.sample_rate)
-    inside = _window(clock, experiment)
-    scales = {c.name: _position_scale(opened, c) for c in positions}
-    drive = columns.get("input")
-    y, good, said = repair_positions(
-        t,
-        {c.name: table.values[c.index] * scales[c.name] for c in positions},
-        None if drive is None else table.values[drive.index],
-        unit=opened.system.position.unit,
-        scales=scales,
-        wanted=experiment.repair.model_dump(),
-    )
-    notes += said
-    keep = np.flatnonzero(good & inside)
-    u, input_scale = _input(opened)
-    reference = _reference(opened, keep)
-    measured = {f"the position of cart {c.cart}": y[c.name] for c in positions}
-    measured |= {"the input": u, "the reference": reference, "the time": t - t[0]}
-    for what, values in measured.items():
-        if values is not None:
-            refuse_extreme(values, what=f"{table.source}: {what}")
-    t, u = t[keep], None if u is None else u[keep]
-    free = {c.name: y[c.name][keep] for c in positions if c.cart in experiment.carts}
-    notes += channel_problems(t, u, free)
-    return Record(
-        id=experiment.id,
-        kind=experiment.kind,
-        t=t,
-        u=u,
-        y=np.array([y[c.name][keep] for c in positions]),
-        carts=tuple(column.cart for column in positions),
-        free=experiment.carts,
-        reference=reference,
-        omega=None if experiment.frequency is None else 2 * np.pi * experiment.frequency,
-        resolution=np.array([
-            scales[c.name] if holds_counts(table, c) else encoder_step(y[c.name])
-            for c in positions
-        ]),
-        hold=experiment.hold,
-        source=experiment.file,
-        notes=tuple(notes),
-        position_scale=scales[positions[0].name],
-        input_scale=input_scale,
-        heading_units=tuple(dict.fromkeys(opened.headed)),
-    )  # fmt: skip
-
-
 def _window(clock: Clock, experiment: Experiment) -> NDArray[np.bool_]:
     """Return which samples are inside the experiment's window; all if it has no window."""
     start, end = experiment.window or (-np.inf, np.inf)
@@ -315,89 +203,181 @@ def _window(clock: Clock, experiment: Experiment) -> NDArray[np.bool_]:
     return inside
 
 
-# ------------------------------------------------------------------------ units and signs
+class _Reading:
+    """One experiment's file on its way to a record.
 
+    Attributes
+    ----------
+    columns : the column of each role.
+    positions : the columns of positions, by cart.
+    notes, headed : what is found: notes, and the units of headings.
+    """
 
-def _position_scale(opened: _Opened, column: Column) -> float:
-    """Return position units per number in the file."""
-    table, stated = opened.table, opened.system.position
-    unit, per_count = stated.unit, stated.per_count
-    if not holds_counts(table, column):
-        return _unit_scale(opened, column, unit, "position")
-    if per_count is not None:
-        return per_count
-    if is_count(unit) or not (table.format.positions == "count" or column.is_counted):
-        return 1.0
-    raise SubmissionError(
-        f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
-        f"count is: position = {{ unit = {unit!r}, per_count = … }}; or use counts: "
-        "position = { unit = 'count' }"
-    )
-
-
-def _unit_scale(
-    opened: _Opened, column: Column, unit: str, role: Literal["position", "input"]
-) -> float:
-    """Return the factor from the heading's unit to the submission's, and add a note."""
-    refuse_unknown_unit(opened.table, column, stated=unit)
-    factor = conversion(column.unit, unit)
-    if column.unit is not None:
-        converts = factor is not None
-        opened.headed.append(
-            HeadingUnit(role=role, heading=column.name, unit=column.unit, converts=converts)
+    def __init__(self, table: FileTable, experiment: Experiment, system: System) -> None:
+        self.table, self.experiment, self.system = table, experiment, system
+        self.headed: list[HeadingUnit] = []
+        own, free = experiment.columns or {}, experiment.carts
+        shared = {
+            role: column
+            for role, column in system.columns.items()
+            if table.has(column) and column not in own.values()
+        }
+        columns, unused = assign_columns(table, explicit=shared | own, free=free)
+        self.columns = columns
+        # A column that the experiment needs may not have empty or broken cells.
+        left_out = replace(
+            table, names=tuple(table.partial), values=np.zeros((len(table.partial), 1))
         )
-    if factor not in (None, 1.0):
-        said = f"{column.name!r} was converted from {column.unit} to {unit}"
-        opened.notes.append(Note(said, "converted", about=column.name))
-    return 1.0 if factor is None else factor
-
-
-def _input(opened: _Opened) -> tuple[Array | None, float]:
-    """Return the input in input units and the scale used; an unknown sign is not applied."""
-    table, experiment, stated = opened.table, opened.experiment, opened.system.input
-    column = opened.columns.get("input")
-    if column is None:
-        if experiment.kind in _NEED_INPUT:
+        needed = {"time", *(f"x{cart}" for cart in free)} - columns.keys()
+        needed |= {"input"} - columns.keys() if experiment.kind in _NEED_INPUT else set()
+        partial, _ = assign_columns(left_out, explicit=None, free=free)
+        table.refuse_partial(column.name for role, column in partial.items() if role in needed)
+        measured = {c.cart: c for role, c in columns.items() if role[0] == "x"}
+        self.positions = [measured[cart] for cart in sorted(measured) if cart <= system.carts]
+        if not self.positions:
             raise SubmissionError(
-                f"{table.source}: a {experiment.kind} needs the input, and no column is one; "
-                f'it has {table.headings()}; say which: columns = {{ input = "…" }}'
+                f"{table.source}: no column is a cart's position; it has {table.headings()}; "
+                f'say which: columns = {{ time = "…", input = "…", x{free[0]} = "…" }}'
             )
-        return None, 1.0
-    override = experiment.input
-    values, per_count = table.values[column.index], stated.per_count
-    in_counts = table.whole[column.index] and (
-        table.format.inputs == "count"
-        or column.is_duty
-        or (per_count is not None and (table.format.inputs == "unknown" or column.is_counted))
-    )
-    if per_count is not None and column.unit is None:
-        # Large whole numbers, such as "512.0", are counts, not volts.
-        is_whole = bool(np.all(values == np.round(values)))
-        in_counts = in_counts or (is_whole and np.abs(values).max() > _FEW_COUNTS)
-    if override is not None and override.per_count is not None:
-        scale = override.per_count
-    elif in_counts:
-        scale = per_count or DUTY_COUNT
-        if per_count is None:
-            said = f"{column.name!r} is taken as duty counts of 5/4096 {stated.unit}"
-            opened.notes.append(Note(said, "duty", about=column.name))
-    else:
-        scale = _unit_scale(opened, column, stated.unit, "input")
-    return values * scale, scale
+        if not {column.cart for column in self.positions} & set(free):
+            raise SubmissionError(
+                f"{table.source}: the free carts are {list(free)}, but the file measures "
+                f"{[column.cart for column in self.positions]}; check `carts` and `file`"
+            )
+        self.notes = list(table.notes)
+        extra = [column.name for column in measured.values() if column not in self.positions]
+        if unused or extra:
+            names = ", ".join([*unused, *extra])
+            self.notes.append(Note(f"columns not used: {names}", "unused", about=names))
 
+    def record(self) -> Record:
+        """Return the record with the input's scale applied, but without an unknown sign."""
+        table, experiment, columns = self.table, self.experiment, self.columns
+        positions, time, rate = self.positions, columns.get("time"), experiment.sample_rate
+        clock = read_clock(time_stamps(table, time, sample_rate=rate))
+        t = clock.t
+        if time is not None:
+            self.notes += clock_notes(table, time, clock, sample_rate=rate)
+        inside = _window(clock, experiment)
+        scales = {c.name: self._position_scale(c) for c in positions}
+        drive = columns.get("input")
+        y, good, said = repair_positions(
+            t,
+            {c.name: table.values[c.index] * scales[c.name] for c in positions},
+            None if drive is None else table.values[drive.index],
+            unit=self.system.position.unit,
+            scales=scales,
+            wanted=experiment.repair.model_dump(),
+        )
+        self.notes += said
+        keep = np.flatnonzero(good & inside)
+        u, input_scale = self._input()
+        reference = self._reference(keep)
+        measured = {f"the position of cart {c.cart}": y[c.name] for c in positions}
+        measured |= {"the input": u, "the reference": reference, "the time": t - t[0]}
+        for what, values in measured.items():
+            if values is not None:
+                refuse_extreme(values, what=f"{table.source}: {what}")
+        t, u = t[keep], None if u is None else u[keep]
+        free = {c.name: y[c.name][keep] for c in positions if c.cart in experiment.carts}
+        self.notes += channel_problems(t, u, free)
+        return Record(
+            id=experiment.id,
+            kind=experiment.kind,
+            t=t,
+            u=u,
+            y=np.array([y[c.name][keep] for c in positions]),
+            carts=tuple(column.cart for column in positions),
+            free=experiment.carts,
+            reference=reference,
+            omega=None if experiment.frequency is None else 2 * np.pi * experiment.frequency,
+            resolution=np.array([
+                scales[c.name] if holds_counts(table, c) else encoder_step(y[c.name])
+                for c in positions
+            ]),
+            hold=experiment.hold,
+            source=experiment.file,
+            notes=tuple(self.notes),
+            position_scale=scales[positions[0].name],
+            input_scale=input_scale,
+            heading_units=tuple(dict.fromkeys(self.headed)),
+        )  # fmt: skip
 
-def _reference(opened: _Opened, keep: NDArray[np.intp]) -> Array | None:
-    """Return the set point of a closed loop, from the experiment's table or else from its file."""
-    table, experiment, columns = opened.table, opened.experiment, opened.columns
-    if experiment.kind != "closed_loop":
-        return None
-    if experiment.reference is not None:
-        return np.full(keep.size, experiment.reference)
-    if (column := columns.get("reference")) is None:
-        return None
-    values, first = table.values[column.index], columns.get("x1")
-    if first and holds_counts(table, column) and mirrors(values, table.values[first.index]):
-        said = f"{column.name!r} only copies {first.name!r}, so it is not a reference"
-        opened.notes.append(Note(said, "copied", about=column.name))
-        return None
-    return values[keep] * _position_scale(opened, column)
+    def _position_scale(self, column: Column) -> float:
+        """Return position units per number in the file."""
+        table, stated = self.table, self.system.position
+        unit, per_count = stated.unit, stated.per_count
+        if not holds_counts(table, column):
+            return self._unit_scale(column, unit, "position")
+        if per_count is not None:
+            return per_count
+        if is_count(unit) or not (table.format.positions == "count" or column.is_counted):
+            return 1.0
+        raise SubmissionError(
+            f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
+            f"count is: position = {{ unit = {unit!r}, per_count = … }}; or use counts: "
+            "position = { unit = 'count' }"
+        )
+
+    def _unit_scale(self, column: Column, unit: str, role: Literal["position", "input"]) -> float:
+        """Return the factor from the heading's unit to the submission's, and add a note."""
+        refuse_unknown_unit(self.table, column, stated=unit)
+        factor = conversion(column.unit, unit)
+        if column.unit is not None:
+            converts = factor is not None
+            self.headed.append(
+                HeadingUnit(role=role, heading=column.name, unit=column.unit, converts=converts)
+            )
+        if factor not in (None, 1.0):
+            said = f"{column.name!r} was converted from {column.unit} to {unit}"
+            self.notes.append(Note(said, "converted", about=column.name))
+        return 1.0 if factor is None else factor
+
+    def _input(self) -> tuple[Array | None, float]:
+        """Return the input in input units and the scale used; an unknown sign is not applied."""
+        table, experiment, stated = self.table, self.experiment, self.system.input
+        column = self.columns.get("input")
+        if column is None:
+            if experiment.kind in _NEED_INPUT:
+                raise SubmissionError(
+                    f"{table.source}: a {experiment.kind} needs the input, and no column is one; "
+                    f'it has {table.headings()}; say which: columns = {{ input = "…" }}'
+                )
+            return None, 1.0
+        override = experiment.input
+        values, per_count = table.values[column.index], stated.per_count
+        in_counts = table.whole[column.index] and (
+            table.format.inputs == "count"
+            or column.is_duty
+            or (per_count is not None and (table.format.inputs == "unknown" or column.is_counted))
+        )
+        if per_count is not None and column.unit is None:
+            # Large whole numbers, such as "512.0", are counts, not volts.
+            is_whole = bool(np.all(values == np.round(values)))
+            in_counts = in_counts or (is_whole and np.abs(values).max() > _FEW_COUNTS)
+        if override is not None and override.per_count is not None:
+            scale = override.per_count
+        elif in_counts:
+            scale = per_count or DUTY_COUNT
+            if per_count is None:
+                said = f"{column.name!r} is taken as duty counts of 5/4096 {stated.unit}"
+                self.notes.append(Note(said, "duty", about=column.name))
+        else:
+            scale = self._unit_scale(column, stated.unit, "input")
+        return values * scale, scale
+
+    def _reference(self, keep: NDArray[np.intp]) -> Array | None:
+        """Return the set point of a closed loop, as the experiment states it or from its file."""
+        table, experiment, columns = self.table, self.experiment, self.columns
+        if experiment.kind != "closed_loop":
+            return None
+        if experiment.reference is not None:
+            return np.full(keep.size, experiment.reference)
+        if (column := columns.get("reference")) is None:
+            return None
+        values, first = table.values[column.index], columns.get("x1")
+        if first and holds_counts(table, column) and mirrors(values, table.values[first.index]):
+            said = f"{column.name!r} only copies {first.name!r}, so it is not a reference"
+            self.notes.append(Note(said, "copied", about=column.name))
+            return None
+        return values[keep] * self._position_scale(column)

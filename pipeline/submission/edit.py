@@ -171,18 +171,7 @@ def toml_item(value: Value) -> Any:
 
 # --------------------------------------------------------------------------------- a new submission
 
-NOTES_TEMPLATE = """\
-<!-- What you write here becomes the discussion of the report (Markdown). Comments like this do not.
-
-     `cartlab report` asks the questions that your data raise, for example about zeta_b. Answer
-     under a heading with that name; the report shows the answer below the question:
-
-     ## zeta_b
-     The decay saw …
-
-     Everything else is free text: what limits the model? What would you record next?
-     LaTeX between dollars becomes a formula: $\\zeta_b$. -->
-"""
+NOTES_TEMPLATE = (TEMPLATES / "notes.md").read_text(encoding="utf-8")
 
 
 def new_submission(folder: Path, *, carts: int) -> None:

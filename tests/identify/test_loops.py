@@ -181,25 +181,6 @@ def test_the_gains_are_verified(name, method, sample_time):
     assert check.value > check.limit
 
 
-@pytest.mark.parametrize("sample_time", [None, 0.001])
-@pytest.mark.parametrize(("name", "method"), CASES)
-def test_python_control_finds_the_same_loop(name, method, sample_time):
-    """Gains of python-control's `dlqr` or `place` give the same characteristic polynomial."""
-    chain = PLANTS[name]
-    design, _ = designed(chain, method, sample_time=sample_time)
-    sampled = control.sample_system(chain.to_control(), design.sample_time)
-    if design.requested_poles is None:
-        theirs, _, _ = control.dlqr(sampled, design.Q, design.R)
-    else:
-        theirs = control.place(sampled.A, sampled.B, np.exp(sampled.dt * design.requested_poles))
-
-    def polynomial(gains):
-        return np.poly(np.linalg.eigvals(sampled.A - sampled.B @ np.reshape(gains, (1, -1))))
-
-    # The designed gains themselves have errors of up to 1e-8 of a coefficient.
-    assert_allclose(polynomial(design.gains), polynomial(theirs), atol=1e-6)
-
-
 def test_double_poles_are_verified_too():
     """A design with double poles passes the check of its gains."""
     chain = PRESETS["throne-3dof"]

@@ -323,22 +323,16 @@ def test_a_window_keeps_its_part_of_the_times(tmp_path):
     assert_allclose(both.t, T[10:21], atol=1e-6)  # the samples at both ends belong to it
 
 
-LATE = csv(time=T + np.where(T > 2.0, 0.7, 0.0), input=U, x1=X1)
-CLIPPED = np.round(np.clip(1.5 * np.sin((3 + 2 * T) * T), -1.0, 1.0), 6)
 STUCK = np.round(440 * 5 * np.sin(6 * T))
 STUCK[200:240] = STUCK[199]
-SWEEP = csv(time=T, input=CLIPPED, x1=STUCK)
+SWEEP = csv(time=T, input=np.sin((3 + 2 * T) * T), x1=STUCK)
 COPY = np.round(0.5 * X1 + 0.5 * np.r_[0.0, X1[:-1]])
 SIX = csv(time=T, input=U, x1=X1, x3=X2, temperature=0 * T)
 NOTES = {
     # name: experiment, content, code of the note, its column, its samples
     "whole seconds": (STEP, csv(time=np.arange(N), input=U, x1=X1), "slow", "time", ()),
-    "a pause": (STEP, LATE, "gap", "", (np.argmax(T > 2.0),)),
     "too many columns": (STEP, SIX, "unused", "temperature, x3", ()),
     "a stuck encoder": ('kind = "sweep"', SWEEP, "stuck", "x1", (199, 239)),
-    "a clipped input": (
-        'kind = "sweep"', SWEEP, "clipped", "", tuple(np.flatnonzero(np.abs(CLIPPED) == 1.0)),
-    ),
     "a commanded position that copies encoder 1": (
         LOOP, ecp(reference=COPY, x1=X1, effort=U), "copied", "Commanded Pos", (),
     ),
