@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
@@ -252,11 +251,17 @@ def _is_straight(stamps: Array, rounding: float) -> bool:
     # Very few stamps may be one step off, because a tick was late or missing.
     if off.max() <= 1.5 and np.mean(off <= _ROUNDING_BAND) >= 0.99:
         return True
+    # A stamp further from the line than 0.9 steps did not advance.
+    if off.max() >= 0.9:
+        return False
+    # Imported late, because this takes a while and is seldom needed.
+    from scipy.optimize import minimize_scalar
+
     # If a few stamps jump, a least-squares line tilts, but a strip of the rounding's width does
-    # not. A stamp further from the line than 0.9 steps did not advance.
+    # not.
     tilt = np.linspace(-1.0, 1.0, stamps.size)
     narrowest = minimize_scalar(lambda x: np.ptp(signed - x * tilt), bounds=(-2, 2))
-    return bool(narrowest.fun <= 2 * _ROUNDING_BAND and off.max() < 0.9)
+    return bool(narrowest.fun <= 2 * _ROUNDING_BAND)
 
 
 def _centred(n: int) -> Array:
