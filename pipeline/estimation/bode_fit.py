@@ -202,7 +202,6 @@ def _response_residuals(
 # Reference: Throne (2005), sections on the two and three degree of freedom systems.
 
 _FARTHEST = 50.0  # bound of a logarithm, so that a step that goes astray does not overflow
-_ZETA_RANGE = (0.01, 1.0)  # damping ratios allowed at the start; others do not converge
 
 
 def fit_stage_by_stage(
@@ -240,7 +239,8 @@ def _start(known: Mapping[str, float], i: int, *, n: int, like: Chain) -> Array:
     for j, suffix in enumerate(_suffixes(i, n=n)):
         omega[j] = known.get(f"omega_{suffix}", omega[j])
         zeta[j] = known.get(names.mode_zeta(suffix), zeta[j])
-    return np.log([omega, np.clip(zeta, *_ZETA_RANGE)])
+    # From damping ratios outside this range, the fit does not converge.
+    return np.log([omega, np.clip(zeta, 0.01, 1.0)])
 
 
 def _suffixes(i: int, *, n: int) -> list[str]:
@@ -321,7 +321,6 @@ def _named(gains: Array, factors: list[Array], found: Chain) -> dict[str, float]
 # ---------------------------------------------------------------------- the joint fit
 
 _START_SPREAD = 0.5  # standard deviation of ln m and ln k in random starts
-_START_ZETAS = (0.02, 0.3)
 _NEAR, _PRECISION = 1e-3, 1e-8  # relative change of the cost at the end of the first and last fit
 _SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # bounds and precision of an added error
 
@@ -428,7 +427,7 @@ def _random_starts(like: Chain, *, bench: Setup) -> Iterator[Chain]:
     for _ in range(8):
         m = like.m * np.exp(_START_SPREAD * rng.standard_normal(like.m.shape))
         k = like.k * np.exp(_START_SPREAD * rng.standard_normal(like.k.shape))
-        zeta = float(np.exp(rng.uniform(*np.log(_START_ZETAS))))
+        zeta = float(np.exp(rng.uniform(*np.log([0.02, 0.3]))))
         yield physical_start(Chain(m=m, c=like.c, k=k), bench=bench, zeta=zeta)
 
 

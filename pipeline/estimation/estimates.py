@@ -70,13 +70,6 @@ def estimate_initially(
 # read by eye, it is 29 %. Damping ratios differ by half and more.
 GAIN_AND_FREQUENCY_LIMIT, DAMPING_LIMIT = 15.0, 50.0  # percent
 SIGMA_LIMIT = 3.0  # combined standard errors; a smaller difference may be due to chance
-_UNDECIDED = "the two estimates are too uncertain to agree or to disagree"
-AT_BOUND = "the fit puts it at zero because it has too few data, so there is no final value"
-NOT_DETERMINED = (
-    "not determined: the standard error is {percent:.0f} % of the value, more than the "
-    "{limit:.0f} % that initial and final may differ by"
-)
-_ONE_SOURCE = "the fit's own points do not determine it, so the final value uses the decay too"
 
 
 def compare(
@@ -104,7 +97,7 @@ def compare(
             note, after = reason, None
         one_source = before is not None and after is not None and before.source == after.source
         if one_source:
-            note = _ONE_SOURCE
+            note = "the fit's own points do not determine it, so the final value uses the decay too"
         elif before is not None and after is not None and before.value != 0:
             percent = 100 * (after.value - before.value) / abs(before.value)
             if before.source != "assumed":
@@ -112,7 +105,8 @@ def compare(
                 sigmas = _combined_sigmas(before, after)
                 consistent = abs(percent) <= change_limit(name)
                 if not consistent and sigmas is not None and sigmas <= SIGMA_LIMIT:
-                    consistent, note = None, _UNDECIDED
+                    consistent = None
+                    note = "the two estimates are too uncertain to agree or to disagree"
         rows.append(
             results.ParameterRow(
                 name=name,
@@ -154,10 +148,15 @@ def _determined_by(
 def undetermined_reason(name: str, final: results.Estimate) -> str:
     """Return why a fitted value cannot be relied on, or ""."""
     if final.at_bound:
-        return AT_BOUND
+        return "the fit puts it at zero because it has too few data, so there is no final value"
     percent = 100 * (final.std or 0.0) / abs(final.value) if final.value else np.inf
     limit = change_limit(name)
-    return NOT_DETERMINED.format(percent=percent, limit=limit) if percent > limit else ""
+    if not percent > limit:
+        return ""
+    return (
+        f"not determined: the standard error is {percent:.0f} % of the value, more than the "
+        f"{limit:.0f} % that initial and final may differ by"
+    )
 
 
 def change_limit(name: str) -> float:
