@@ -108,8 +108,7 @@ def _driven_groups(
             break
         groups.append((members, own))
         rest = [record for record in rest if record not in members]
-    # Nine tenths of the driven recordings must be in a group.
-    most = len(rest) <= (1 - 0.9) * len(driven)
+    most = 10 * len(rest) < len(driven)  # more than nine tenths are in a group
     return groups if most and _overlap([members for members, _ in groups]) else []
 
 
