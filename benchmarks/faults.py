@@ -9,6 +9,7 @@ failed. The list stays true, because a fragment that is not found exactly once i
 are those of a processor.
 """
 
+import argparse
 import os
 import re
 import shutil
@@ -163,10 +164,15 @@ def judge_fault(fault: Fault, checkout: Path, *, wider: bool) -> dict[str, Outco
         path.write_text(right, "utf-8")
 
 
-def main(arguments: Sequence[str]) -> None:
+def main() -> None:
     """Print a row for each fault as soon as it is known, and the counts."""
-    chosen = [one for one in arguments if not one.startswith("--")]
-    wider, found = "--suite" in arguments, list[dict[str, Outcome]]()
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.faults")
+    parser.add_argument("chosen", nargs="*", metavar="FILE|NUMBER", help="all, if none is given")
+    parser.add_argument(
+        "--suite", action="store_true", help="all tests, if those of the room notice nothing"
+    )
+    asked = parser.parse_args()
+    chosen, wider, found = asked.chosen, asked.suite, list[dict[str, Outcome]]()
     print("| fault | what breaks | noticed by | s |\n| --- | --- | --- | --- |")
     with tempfile.TemporaryDirectory() as folder:
         checkout = Path(folder) / "checkout"
@@ -185,4 +191,4 @@ def main(arguments: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()
