@@ -167,7 +167,7 @@ def judge_fault(fault: Fault, checkout: Path, *, wider: bool) -> dict[str, Outco
 def main() -> None:
     """Print a row for each fault as soon as it is known, and the counts."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.faults")
-    parser.add_argument("chosen", nargs="*", metavar="FILE|NUMBER", help="all, if none is given")
+    parser.add_argument("chosen", nargs="*", metavar="FILE|NUMBER", help="default: all")
     parser.add_argument(
         "--suite", action="store_true", help="all tests, if those of the room notice nothing"
     )

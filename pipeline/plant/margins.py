@@ -151,13 +151,15 @@ def _crossings(curve: Callable[[Array], Array], omega: Array) -> Array:
 
 def _least(curve: Callable[[Array], Array], omega: Array) -> tuple[float, float]:
     """Return the least value of a curve and its frequency, searched around the least of `omega`."""
-    from scipy.optimize import minimize_scalar
+    from scipy.optimize import OptimizeResult, minimize_scalar
 
     omega = np.unique(omega)
     values = curve(omega)
     i = int(values.argmin())
     bounds = omega[max(i - 1, 0)], omega[min(i + 1, omega.size - 1)]
-    found = minimize_scalar(lambda w: curve(np.array([w]))[0], bounds=bounds, method="bounded")
+    found: OptimizeResult = minimize_scalar(
+        lambda w: curve(np.array([w]))[0], bounds=bounds, method="bounded"
+    )
     if found.fun < values[i]:
         return float(found.fun), float(found.x)
     return float(values[i]), float(omega[i])
