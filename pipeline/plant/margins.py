@@ -5,7 +5,7 @@ moment at which the input acts; the delay is one sample.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -151,18 +151,17 @@ def _crossings(curve: Callable[[Array], Array], omega: Array) -> Array:
 
 def _least(curve: Callable[[Array], Array], omega: Array) -> tuple[float, float]:
     """Return the least value of a curve and its frequency, searched around the least of `omega`."""
-    from scipy.optimize import OptimizeResult, minimize_scalar
+    from scipy.optimize import fminbound
+
+    def value(at: float) -> float:
+        return float(curve(np.array([at]))[0])
 
     omega = np.unique(omega)
     values = curve(omega)
     i = int(values.argmin())
-    bounds = omega[max(i - 1, 0)], omega[min(i + 1, omega.size - 1)]
-    found: OptimizeResult = minimize_scalar(
-        lambda w: curve(np.array([w]))[0], bounds=bounds, method="bounded"
-    )
-    if found.fun < values[i]:
-        return float(found.fun), float(found.x)
-    return float(values[i]), float(omega[i])
+    found = fminbound(value, omega[max(i - 1, 0)], omega[min(i + 1, omega.size - 1)])
+    at = cast("float", found)
+    return min((value(at), at), (float(values[i]), float(omega[i])))
 
 
 def _frequencies(z: ComplexArray, *, sample_time: float) -> Array:
