@@ -2,14 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeVar
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.optimize import OptimizeResult, least_squares, leastsq
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.noise import relative_psd
+
+# scipy is imported late, as it takes a fifth of a second: the process that draws fits nothing
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
 
 # ----------------------------------------------------- residual and Jacobian from one evaluation
 
@@ -26,12 +28,14 @@ def minimise(
     bounds: tuple[Any, Any] = (-np.inf, np.inf),
     scale: float | Literal["jac"] = 1.0,
     tolerance: float = 1e-8,
-) -> OptimizeResult:
+) -> "OptimizeResult":
     """Minimise the sum of squares of the residual, starting from `start` (n_p,).
 
     `at` returns the residual (n,) and the Jacobian (n, n_p) at p. `tolerance` is the relative
     change of the cost at which the search stops.
     """
+    from scipy.optimize import least_squares
+
     once = evaluated_once(at)
     return least_squares(
         lambda p: once(p)[0],
@@ -112,6 +116,8 @@ def fit_separable(
     and of the slope.
     """
 
+    from scipy.optimize import leastsq
+
     def jacobian(point: SeparableFit) -> Array:
         J = point.model.derivatives(point.linear)
         return J - point.basis @ (point.basis.T @ J)
@@ -151,6 +157,8 @@ def solve_linear(y: Array, model: Callable[[Array], SeparableModel], p: Array) -
     least = np.finfo(np.float64).eps * len(X) * np.max(sizes)
     # Columns that differ by a thousand rounding errors need no singular values.
     if np.min(sizes) > 1e3 * least:
+        from scipy.linalg import solve_triangular
+
         linear = solve_triangular(upper, y @ basis, check_finite=False)
     else:  # far from the solution, columns may be nearly equal; they then share their contribution
         basis, sizes, turn = np.linalg.svd(X, full_matrices=False)

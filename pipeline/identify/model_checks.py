@@ -10,7 +10,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import solve_discrete_are
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
@@ -547,6 +546,8 @@ def _loops(chain: Chain, design: FeedbackDesign) -> tuple[Array, Array, float]:
 
 def _riccati_gains(phi: Array, gamma: Array, *, Q: Array, R: float) -> Array:
     """Return the LQR gains from scipy's Riccati solver, independently of the design."""
+    from scipy.linalg import solve_discrete_are  # takes a tenth of a second, so it is imported here
+
     cost = solve_discrete_are(phi, gamma[:, None], Q, R)
     return (gamma @ cost @ phi) / (R + gamma @ cost @ gamma)
 

@@ -1,6 +1,7 @@
 """Make a document's files (the page, the PDF and the figures) and write them into a folder."""
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from pipeline.output import clear_files, own_folder, write_file
@@ -16,9 +17,12 @@ def make_files(document: Document, *, name: str, pdf: bool) -> Made:
     from pipeline.report.html import render_html
     from pipeline.report.pdf import render_pdf
 
-    drawn = {f"{FIGURES}/{one.name}.svg": one.svg for one in document.pictures()}
-    printed = {f"{name}.pdf": render_pdf(document)} if pdf else {}
-    return {**drawn, f"{name}.html": render_html(document), **printed}
+    drawn: Made = {f"{FIGURES}/{one.name}.svg": one.svg for one in document.pictures()}
+    with ThreadPoolExecutor(1) as thread:  # typst computes without the interpreter's lock
+        printed = thread.submit(render_pdf, document) if pdf else None
+        page = render_html(document)
+        made = {**drawn, f"{name}.html": page}
+        return made if printed is None else {**made, f"{name}.pdf": printed.result()}
 
 
 def write_document(document: Document, out: Path, *, name: str, pdf: bool) -> None:
