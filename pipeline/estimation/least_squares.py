@@ -115,7 +115,6 @@ def fit_separable(
     `scale` is the typical size of p, `precision` the relative tolerance of the sum of squares, of p
     and of the slope.
     """
-
     from scipy.optimize import leastsq
 
     def jacobian(point: SeparableFit) -> Array:
