@@ -96,6 +96,8 @@ def find_order(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n:
         entries = compare_entries(space, models=models, n=n, order=order)
         return sum(entry.wrong for entry in entries)
 
+    if not wrong(usual):
+        return usual
     orders = [usual]
     for carts in itertools.permutations(range(n)):
         order = [0] * (2 * n)
