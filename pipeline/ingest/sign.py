@@ -210,7 +210,10 @@ def _explain(motion: Array, drive: Array) -> tuple[Array, float]:
     """Return the non-negative weights (4,), and the norm of the drive that they do not explain."""
     try:
         return nnls(motion, drive)
-    except RuntimeError:  # no solution, so nothing is explained
+    except (
+        RuntimeError,
+        np.linalg.LinAlgError,
+    ):  # no solution, or columns are equal (scipy < 1.15)
         return np.zeros(motion.shape[1]), float(np.linalg.norm(drive))
 
 
