@@ -210,10 +210,8 @@ def _explain(motion: Array, drive: Array) -> tuple[Array, float]:
     """Return the non-negative weights (4,), and the norm of the drive that they do not explain."""
     try:
         return nnls(motion, drive)
-    except (
-        RuntimeError,
-        np.linalg.LinAlgError,
-    ):  # no solution, or columns are equal (scipy < 1.15)
+    # No solution, so nothing is explained. Equal columns end scipy before 1.15.
+    except (RuntimeError, np.linalg.LinAlgError):
         return np.zeros(motion.shape[1]), float(np.linalg.norm(drive))
 
 
