@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from pipeline.gap.judge import Hypothesis, Study, reach_verdict, worth_it
+from pipeline.gap.summary import list_effects
 from pipeline.plant.catalogue import find_effect
+from pipeline.setup import Units
 
 FLOOR = 0.01
 COULOMB, SECOND = ("coulomb_friction", 1), ("coulomb_friction", 2)
@@ -31,7 +33,7 @@ def hypothesis(
     effects = [SimpleNamespace(key=key, effect=find_effect(key[0])) for key in keys]
     structure = SimpleNamespace(effects=effects)
     fit: Any = SimpleNamespace(chi=1.0, n_points=n_points, structure=structure)
-    left: Any = SimpleNamespace(chi=held)
+    left: Any = SimpleNamespace(chi=held, n_points=n_points)
     return Hypothesis(
         fit=fit,
         held=left,
@@ -158,3 +160,21 @@ def test_noise_and_repeats_excuse_an_error(error, repeatability, explained):
     """`explains` allows twice the noise or 1.5 times the repeats, whichever is larger."""
     study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
     assert Study.explains(study, SimpleNamespace(error=error)) == explained  # type: ignore[arg-type]
+
+
+def test_an_effect_that_all_explanations_share_is_certain():
+    """Two explanations, equally good, share the friction: only the other effect is in doubt."""
+    alone = hypothesis(COULOMB, error=0.2, bic=-500)
+    drag, delay = (hypothesis(COULOMB, key, error=0.01, bic=-900) for key in (DRAG, DELAY))
+    terms = [
+        SimpleNamespace(effect=effect, where={}, values=np.ones(len(effect.parameters)))
+        for effect in (find_effect(COULOMB[0]), find_effect(DRAG[0]))
+    ]
+    structure = drag.fit.structure
+    final: Any = SimpleNamespace(structure=structure, covariance=None, terms=terms, chi=1.0)
+    found = [LINEAR, alone, drag, delay]
+    friction, second = list_effects(
+        (LINEAR, alone, drag), final, found, Units(position="cm", input="V")
+    )
+    assert (friction.confidence, second.confidence) == (1.0, 0.5)
+    assert [rival.confidence for rival in second.rivals] == [0.5]
