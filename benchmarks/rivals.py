@@ -15,12 +15,10 @@ from pathlib import Path
 
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
-import json
-
 from benchmarks.drawn import acted, counted, draw, run_study, wilson
 from pipeline.errors import PipelineError
 from pipeline.experiments.discriminate import propose_for
-from pipeline.experiments.plan import Recording, load_plan
+from pipeline.experiments.plan import load_plan
 from pipeline.experiments.propose import renamed
 from pipeline.gap.explain import investigate
 from pipeline.gap.types import FoundEffect, Gap
@@ -53,9 +51,9 @@ def run(seed: int) -> dict:
                 looks.append(told(gap))
                 if gap.verdict not in OPEN or gap.proposal is None or len(looks) > MORE:
                     break
-                proposed = Recording.model_validate_json(json.dumps(gap.proposal.recording))
                 taken = [e.id for e in load_submission(folder).experiments]
-                bench.record(folder, renamed([proposed], taken=taken), limits=plan.limits)
+                proposed = renamed([gap.proposal.recording], taken=taken)
+                bench.record(folder, proposed, limits=plan.limits)
             row["hidden"] = acted(drawn, load_submission(folder))
         except (PipelineError, AssertionError) as error:
             row["ended"] = f"{type(error).__name__}: {error}"[:200]

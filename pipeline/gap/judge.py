@@ -248,8 +248,10 @@ def fit_free_run(start: GapModel, study: Study) -> GapFit:
     for attempt in range(2):
         if not structure.many_rests or fit.chi < AT_FLOOR:
             break
+        with np.errstate(invalid="ignore"):  # some runs may have diverged
+            better = np.quantile(fit.run_chi, 0.25)
         # A restart of the worst runs makes sense only if the better ones are nearly right.
-        if np.quantile(fit.run_chi, 0.25) < 6.0:
+        if better < 6.0:
             fit = restart_runs(fit, study.training, study.mapper)
         elif attempt:
             break

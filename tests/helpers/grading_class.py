@@ -212,13 +212,12 @@ def _team(
 
 
 def spoil_data(submission: Submission, rng: np.random.Generator) -> None:
-    """Spoil one file: its encoder sticks, it becomes a copy of another, or its end is cut off."""
+    """Spoil one file: its encoder sticks, or it becomes a copy of another."""
     runs = [e for e in submission.experiments if e.kind in ("decay", "step", "sine")]
     run = runs[int(rng.integers(len(runs)))]
     path = submission.folder / run.file
     lines = path.read_text(encoding="utf-8").splitlines()
-    kind = int(rng.integers(3))
-    if kind == 0:  # the encoder sticks while the cart moves
+    if rng.integers(2):  # the encoder sticks while the cart moves
         column = lines[0].split(",").index(f"x{run.carts[0] if run.carts else 1}")
         rows = [line.split(",") for line in lines[1:]]
         x = np.array([float(row[column]) for row in rows])
@@ -226,13 +225,10 @@ def spoil_data(submission: Submission, rng: np.random.Generator) -> None:
         for row in rows[start : start + 60]:
             row[column] = rows[start][column]
         lines = [lines[0], *(",".join(row) for row in rows)]
-    elif kind == 1:
+    else:
         others = [e for e in runs if e.id != run.id]
         other = others[int(rng.integers(len(others)))]
         lines = (submission.folder / other.file).read_text(encoding="utf-8").splitlines()
-    else:
-        lines = lines[: len(lines) // 2]
-        lines[-1] = lines[-1].split(",")[0]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
 
