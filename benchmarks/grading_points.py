@@ -99,7 +99,8 @@ def points(benches: Sequence[Iterable[Grading]]) -> Table:
 table.
 A TA who knew the mistake would take points for the numbers that it changed, and for no others.
 A criterion counts as lost if the same team had more points there before the mistake. Criteria that
-compare two tables, or ask for all pieces, are left out of the last two columns.
+compare two tables, or ask for all pieces, are left out of the last two columns. A named mistake
+costs points once, where it costs most; so other criteria with the same mistake keep theirs.
 """,
     )
 
