@@ -134,7 +134,7 @@ def section(
     tools = ", ".join(f"{tool} {version(tool)}" for tool in (*_BASIC, *module.TOOLS))
     parts.append(
         f"*To repeat: `python -m benchmarks {name}`. It took {seconds:.0f} s of one core on "
-        f"{machine()}; cartlab {__version__}, {tools}.*"
+        f"{machine()}. Versions: cartlab {__version__}, {tools}.*"
     )
     return "\n\n".join(filter(None, parts)) + f"\n\n<!-- end of {name} -->\n"
 
