@@ -133,7 +133,8 @@ def run_tests(
 def pytest_collection_modifyitems(config, items: list) -> None:
     """Put the tests first that name the faulty function, then those of its users."""
     place = {Path(name).resolve(): i for i, name in enumerate(config.args)}
-    names = [re.compile(rf"\b{name}\b") for name in os.environ[_NAMES].split()]
+    # A test may say `awarded` of what `award` returns, and `effects` of a private `_effects`.
+    names = [re.compile(rf"\b{name.lstrip('_')}") for name in os.environ[_NAMES].split()]
 
     def rank(item) -> tuple[int, int]:
         text = getsource(item.obj)

@@ -4,6 +4,8 @@ import json
 from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -186,21 +188,26 @@ FRICTION = {"coulomb_friction": {"cart": 1, "force": Decimal("0.0031")}}
         (None, 0),
     ],
 )
-def test_named_effects_are_judged_by_the_key(friction, effects, share):
+def test_named_effects_are_judged_by_the_key(effects, share):
     """Name, place and each size count equally; an effect that is not there counts as a mistake."""
-    submission, bench = friction
-    bench = replace(bench, model=replace(bench.model, terms=[known(0.0031)]))
-    reported = submission.reported.model_copy(update={"effects": effects})
-    submission = submission.model_copy(update={"reported": reported})
-    work = prepare_work(
-        submission,
-        analyse(submission, design=False),
-        rubric=RUBRIC,
-        bench=json_text(bench),
-    )[0]
-    verdict = judge(NAMED, work)
+    reported = SimpleNamespace(effects=effects)
+    context: Any = SimpleNamespace(
+        effects=[known(0.0031)], reported=reported, because_unread=lambda *_: ""
+    )
+    verdict = judge(NAMED, context)
     assert verdict.share == share
     assert set(verdict.expected) == ({"coulomb_friction"} if effects is not None else set())
+
+
+def test_the_key_knows_the_effects_of_a_bench(friction):
+    """Effects that the student names are judged by those of the bench in the answer key."""
+    submission, bench = friction
+    bench = replace(bench, model=replace(bench.model, terms=[known(0.0031)]))
+    reported = submission.reported.model_copy(update={"effects": FRICTION})
+    submission = submission.model_copy(update={"reported": reported})
+    analysis = analyse(submission, design=False)
+    work = prepare_work(submission, analysis, rubric=RUBRIC, bench=json_text(bench))[0]
+    assert judge(NAMED, work).share == 1
 
 
 def test_without_a_key_nobody_judges_named_effects(friction):
