@@ -257,8 +257,7 @@ class Assistant(Person):
         names = ("team", "criterion", "seen")
         hidden = "".join(rf'<input type="hidden" name="{name}" value="(.*?)">' for name in names)
         waiting = re.findall(rf'class="answering">\s*{hidden}', text)
-        settled = re.findall(rf'again(?:\?[^"]*)?">{hidden}\s*<p><button name="do" value="reopen"',
-                             text)  # fmt: skip
+        settled = re.findall(rf'{hidden}\s*<p><button name="do" value="reopen"', text)
         if waiting:
             team, criterion, seen = self.draw.choice(waiting)
             points = self.draw.choice(["", "0", "0.5"])
