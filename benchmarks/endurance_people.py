@@ -315,6 +315,9 @@ class Student(Person):
         ]
         self.upload(f"{self.room}files", changes, files)
         text = self.get("submission", self.room)
+        if "were not uploaded" in text:  # the worker was killed, and the page says so
+            for change in changes:
+                change.confirmed = False
         self._complete(text)
         if text.count('data-row="') >= FULL and self._folder + 1 < self._folders:
             self._folder += 1
