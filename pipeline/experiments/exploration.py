@@ -31,7 +31,7 @@ from pipeline.json_files import json_text
 from pipeline.names import parameter_names
 from pipeline.output import own_folder, write_file
 from pipeline.plant.effect import AugmentedChain, effect_name
-from pipeline.results import Analysis, Stage
+from pipeline.results import Analysis, Estimate, Stage
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from pipeline.submission.models import MOST_CARTS
@@ -102,8 +102,15 @@ def relative_errors(analysis: Analysis) -> dict[str, float | None]:
     }
 
 
+def is_unstated(errors: dict[str, float | None]) -> bool:
+    """Return whether no parameter has a standard error, as in a fit with backlash."""
+    return all(error is None for error in errors.values())
+
+
 def describe_accuracy(missing: dict[str, float], errors: dict[str, float | None]) -> str:
     """Say how well the parameters are known."""
+    if is_unstated(errors):
+        return WORDS.text("no_errors")
     if not missing:
         worst = max((error for error in errors.values() if error is not None), default=0.0)
         return WORDS.text("all_known", error=f"{100 * worst:.2g} %")
@@ -274,7 +281,7 @@ class Exploration:
             names = " and ".join(f'"{name_model(gap.contenders[i])}"' for i in predicted.pair)
             times = f"{decides.separation:.2g}"
             return [decides.recording], WORDS.text("differ", names=names, times=times)
-        if missing and named:
+        if missing and named and not is_unstated(relative_errors(analysis)):
             n = max(1, int(_SHARE * len(analysis.records)))
             try:
                 found = choose_next(
@@ -512,8 +519,13 @@ def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
     if gap is None or not acting:
         return analysis
     model, covariance = gap.model, gap.chain_covariance
-    if covariance is None or not model.chain.is_tied:
+    if not model.chain.is_tied:
         return analysis
+    if covariance is None:  # the errors of a chain without the effects would be wrong
+        values = model.chain.parameters().items()
+        unknown = {name: Estimate(value=value, std=None, source="gap") for name, value in values}
+        fit = replace(fit, chain=model.chain, parameters=unknown, converged=True)
+        return replace(analysis, fit=fit)
     names = tuple(gap.chain_std)
     # With effects, the residual of the linear chain is not noise, so only the encoders' noise is
     # used.

@@ -242,7 +242,7 @@ def fit_free_run(start: GapModel, study: Study) -> GapFit:
     structure = start.structure
     steps = {} if any(study.springs) else _FINISHED
     fit = study.fit(start, scatter_free=False, **steps)
-    if fit.chi > AT_FLOOR and any(c.effect.has_play for c in structure.effects):
+    if fit.chi > AT_FLOOR and structure.has_play:
         fit = min(fit, _fit_contact_on_pieces(start, study), key=lambda one: one.cost)
     # Two rounds in which friction differs between runs. Before each, the worst runs are restarted.
     for attempt in range(2):

@@ -116,6 +116,11 @@ class Structure:
         return any(c.effect.contact for c in self.effects)
 
     @cached_property
+    def has_play(self) -> bool:
+        """Whether some effect lets the motor lose contact with cart 1."""
+        return any(c.effect.has_play for c in self.effects)
+
+    @cached_property
     def hidden(self) -> tuple[int, ...]:
         """The indices of the carts with a hidden mass."""
         return tuple(sorted(c.place - 1 for c in self.effects if c.effect.hides_mass))

@@ -9,7 +9,6 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.gap.fit import GapFit
 from pipeline.gap.judge import Hypothesis, Study
-from pipeline.gap.limits import AT_FLOOR
 from pipeline.gap.parameters import fresh_nuisance, simulate_run
 from pipeline.gap.runs import GapRun
 from pipeline.gap.types import (
@@ -149,9 +148,7 @@ def list_effects(
         by_name: dict[tuple[str, int], Hypothesis] = {}
         for h in sorted(rivals, key=lambda h: h.bic_of_all):
             by_name.setdefault(_stand_in(added, h.key - rest), h)
-        # If the cost has many narrow minima, its curvature does not give the standard error.
-        rugged = term.effect.contact and final.chi > AT_FLOOR
-        known = None if std is None or rugged else std[structure.span(index)]
+        known = None if std is None else std[structure.span(index)]
         values = {
             p.name: NamedValue(
                 value=float(value),

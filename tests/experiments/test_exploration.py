@@ -114,6 +114,22 @@ def test_a_text_that_is_neither_is_refused(read, text):
         read(text)
 
 
+@pytest.mark.slow
+@pytest.mark.sample
+def test_with_backlash_no_accuracy_is_claimed(tmp_path):
+    """No standard error is stated, so nothing is reached and no recording is meant to lower one."""
+    folder = tmp_path / "work"
+    session = VirtualSession(folder, bench_of("backlash"))
+    turns = exploration(folder, session, goal=ErrorGoal(), seconds=600.0).run()
+    last = turns[-1]
+    assert last.gap is not None
+    assert "backlash" in [one.effect.key for one in last.gap.effects]
+    assert set(last.errors.values()) == {None}
+    assert not last.reached
+    assert "No standard errors can be stated" in last.summary
+    assert last.seconds < 200.0
+
+
 @pytest.fixture(scope="module")
 def explored(tmp_path_factory):
     """Return the exploration of a bench with an end stop on one side that no step reaches."""

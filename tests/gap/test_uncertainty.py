@@ -1,17 +1,20 @@
-"""Standard errors of friction and delay, without contacts, match the actual errors."""
+"""Standard errors match the actual errors; with backlash none are stated."""
 
 import numpy as np
 import pytest
 
 from pipeline.experiments.propose import propose_plan
+from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit import Fitting, covariance, fit_model, measure_noise
 from pipeline.gap.judge import make_candidate
 from pipeline.gap.parameters import Structure
 from pipeline.gap.runs import prepare
+from pipeline.setup import Setup
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.virtual import VirtualBench, new_folder
+from tests.truth.cases import make_case
 
 
 def standardised(folder, *, preset, hide, seed):
@@ -64,3 +67,19 @@ def test_stated_standard_errors_are_right(tmp_path, preset, hide, seeds):
     assert np.mean(np.abs(z) < 2) > 0.8
     assert np.sqrt(np.mean(z**2)) < 1.5
     assert np.sqrt(np.mean(z[:, -1] ** 2)) < 2.0
+
+
+@pytest.mark.parametrize(("effect", "stated"), [("end_stop", True), ("backlash", False)])
+def test_standard_errors_with_a_contact(effect, stated):
+    """Those of an end stop are right; a fit with backlash states none and says why."""
+    case = make_case(seed=900_147, n=1, effects=[effect], severity=0.3)
+    gap = explain_gap(case.records, Setup(springs=case.springs))
+    (found,), (hidden,) = gap.effects, case.hidden
+    assert found.effect.key == effect
+    told = found.parameters | found.details
+    assert [value.std is not None for value in told.values()] == [stated] * len(told)
+    assert bool(gap.chain_std) == (gap.chain_covariance is not None) == stated
+    assert any("no standard errors are stated" in note for note in gap.notes) != stated
+    for name, true in hidden.parameters.items() if stated else ():
+        value = found.parameters[name]
+        assert abs(value.value - float(true)) < 4.0 * value.std
