@@ -82,4 +82,5 @@ def test_standard_errors_with_a_contact(effect, stated):
     assert any("no standard errors are stated" in note for note in gap.notes) != stated
     for name, true in hidden.parameters.items() if stated else ():
         value = found.parameters[name]
+        assert value.std is not None
         assert abs(value.value - float(true)) < 4.0 * value.std
