@@ -37,6 +37,7 @@ Wanted = tuple[int, RecordingKind, Change | None]  # cart, kind, change
 Sides = tuple[tuple[EffectAt, ...], ...]
 
 _WORDS = phrases("gap")
+MOST_NAMES = 3  # most effects named in a sentence
 _TWO_SIZES = 3.0  # motions of one kind whose sizes differ by this factor are small and large ones
 _SHARP = 0.05  # a smaller relative standard error needs no further recording
 _EDGE, _FLAT = 0.2, 0.01  # changes of the input from sample to sample, as shares of its range
@@ -378,7 +379,8 @@ def _in_words(advice: Advice, gap: Gap) -> str:
         for found in effects:
             run = phrases("effects").text(f"in_{found.effect.shown_by.replace(' ', '_')}")
             said.append(_WORDS.text("shows_most", Name=capital(found.name), run=run))
-    one, other = side_names(advice.between) if len(advice.between) == 2 else ("", "")
+    two = len(advice.between) == 2
+    one, other = side_names(advice.between, most=MOST_NAMES) if two else ("", "")
     if advice.aim == "decide" and advice.difference is None and not said:
         said.append(_WORDS.text("either", one=one, other=other))
     if advice.difference is not None and gap.proposal:

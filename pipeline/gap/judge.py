@@ -462,8 +462,8 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
                 if len(effects) > 1:
                     without = _without(chosen, effects[index], study)
                     found.append(without)
-                nothing = sure[index] < SURE  # may be zero, so it must go
                 as_good = all(_as_good(without, one, study) for one in (chosen, best))
+                nothing = _may_be_zero(sure[index], without, chosen)
                 if nothing or (without.is_credible and as_good):
                     needless.append(without)
             if needless:
@@ -501,7 +501,17 @@ def without_zero_effect(chosen: Hypothesis, final: GapFit, study: Study) -> Hypo
     sure = significance(final)
     if not sure or min(sure) >= SURE:
         return None
-    return _without(chosen, chosen.fit.structure.effects[int(np.argmin(sure))], study)
+    without = _without(chosen, chosen.fit.structure.effects[int(np.argmin(sure))], study)
+    return without if _may_be_zero(min(sure), without, chosen) else None
+
+
+def _may_be_zero(sure: float, without: Hypothesis, chosen: Hypothesis) -> bool:
+    """Return whether an effect may be zero, given its distance from zero in standard errors.
+
+    The standard error is also large if the recordings show an effect but hardly tell its force in
+    the unit of the others. An effect that halves the error is not zero.
+    """
+    return sure < SURE and limits.MOSTLY * without.error < chosen.error
 
 
 def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:

@@ -39,6 +39,7 @@ CONTACT_GAIN = 0.5
 # gain, and closer than twice the fall that a new effect needs.
 CLOSE_ERROR, CLOSE_GAIN, CLOSE_BIC = 1.15, 0.10, 2.0 * BIC_DROP
 MOSTLY = 0.5  # share of the linear model's error; above it, most of the gap is unexplained
+NO_MODEL = 0.4  # share of the motion; above it, the model does not fit the recordings at all
 NEAR_FLOOR = 1.5  # times the noise; above it, most of the squared error is not noise
 
 # A constant force must reach three limits. It must exceed this many standard errors, because every

@@ -8,7 +8,13 @@ from matplotlib.figure import Figure
 from pipeline import __version__
 from pipeline.arrays import Array
 from pipeline.estimation.force_balance import without_releases
-from pipeline.gap.advice import differences, disputed, proposed_recording, side_names
+from pipeline.gap.advice import (
+    MOST_NAMES,
+    differences,
+    disputed,
+    proposed_recording,
+    side_names,
+)
 from pipeline.gap.replay import Replay, replay_driven
 from pipeline.gap.residual import ResidualForce, residual_forces
 from pipeline.gap.types import FoundEffect, Gap, GapWindow, RecordGap, Trace
@@ -69,7 +75,6 @@ from pipeline.words.text import Spans, capital, clean, plain
 
 _MOST_ROWS = 28  # most runs in the overview; gap.json has all runs
 LEGEND = 46  # two names with more characters do not fit above a figure
-_MOST_NAMES = 3  # most effects named in a caption; the text above it names all
 _MORE_TRACES = 3  # traces drawn in addition to the one in the summary
 
 
@@ -358,7 +363,7 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
         one=one,
         other=other,
     )
-    short = "; ".join(side_names(sides, most=_MOST_NAMES))
+    short = "; ".join(side_names(sides, most=MOST_NAMES))
     values = {"cart": prediction.cart, "names": short}
     picture = page.picture("predicted", figure, WORDS, "predicted_figure", **values)
     return [paragraph(paragraph_), picture]

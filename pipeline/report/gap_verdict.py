@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.gap.advice import disputed
-from pipeline.gap.limits import AS_REPEATS, AT_FLOOR, NOTHING
+from pipeline.gap.limits import AS_REPEATS, AT_FLOOR, NO_MODEL, NOTHING
 from pipeline.gap.types import FoundEffect, Gap, NamedValue, RecordGap
 from pipeline.plant.effect import Effect, effect_name
 from pipeline.report.document import Block, Tile, Tiles, Tone, bullet_list, paragraph, plain_lines
@@ -33,8 +33,16 @@ def verdict_title(gap: Gap) -> str:
     """Return the verdict in a few words; a set-up in doubt comes before any other cause."""
     if gap.causes and gap.verdict != "none":
         return WORDS.text("title_causes")
-    undecided = gap.verdict == "unexplained" and not gap.complete
-    return WORDS.text("title_undecided" if undecided else f"title_{gap.verdict}")
+    if gap.verdict == "unexplained":
+        return WORDS.text(f"title_{_of_unexplained(gap)}")
+    return WORDS.text(f"title_{gap.verdict}")
+
+
+def _of_unexplained(gap: Gap) -> str:
+    """Return which phrase tells why a gap is unexplained."""
+    if not gap.complete:
+        return "undecided"
+    return "no_model" if min(gap.baseline, gap.final) > NO_MODEL else "unexplained"
 
 
 def is_set_up_alone(gap: Gap) -> bool:
@@ -185,8 +193,8 @@ def _unexplained(gap: Gap) -> Block:
     if is_set_up_alone(gap):
         return paragraph(WORDS.spans("unsuspected", **values))
     if not gap.effects:
-        key = "unexplained" if gap.complete else "undecided"
-        if gap.final < NOTHING * gap.noise_floor:
+        key = _of_unexplained(gap)
+        if gap.final < NOTHING * gap.noise_floor and key != "no_model":
             key = f"{key}_taught"
         return paragraph(WORDS.spans(key, **values))
     suspects = listing([effect_name(found.effect, found.where) for found in gap.effects])
