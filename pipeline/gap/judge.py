@@ -224,6 +224,8 @@ _LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s; with a contact, pieces grow to whole runs
 # Factors on the size and damping of a contact at the start of a fit. The contact in `gap.pem` is
 # rigid, but the simulator's contact is slightly soft.
 _VARIED = ((1.0, 1.0), (1.2, 1.0), (1.0, 0.65), (1.2, 0.65))
+_HOPS, _VAIN = 40, 15  # most jumps, and most in a row that lead nowhere
+_WIDTHS = (0.15, 0.075)  # relative sizes of the jumps of a contact's parameters, in turn
 _NEAR = 8  # iterations of a fit that starts near its end
 # Options without springs: the cost of a whole run has many minima, and small gains add up.
 _FINISHED: dict[str, Any] = {"iterations": 60, "tolerance": 1e-6}
@@ -244,6 +246,7 @@ def fit_free_run(start: GapModel, study: Study) -> GapFit:
     fit = study.fit(start, scatter_free=False, **steps)
     if fit.chi > AT_FLOOR and structure.has_play:
         fit = min(fit, _fit_contact_on_pieces(start, study), key=lambda one: one.cost)
+        fit = _hop(fit, study)
     # Two rounds in which friction differs between runs. Before each, the worst runs are restarted.
     for attempt in range(2):
         if not structure.many_rests or fit.chi < AT_FLOOR:
@@ -289,6 +292,27 @@ def _fit_contact_on_pieces(start: GapModel, study: Study) -> GapFit:
             fit = on_pieces(fit.without_nuisance, length, 8)
         grown.append(study.fit(fit.without_nuisance, iterations=15, scatter_free=False))
     return min(grown, key=lambda one: one.cost)
+
+
+def _hop(fit: GapFit, study: Study) -> GapFit:
+    """Leave the narrow minimum of a fit with backlash for lower ones, by random jumps.
+
+    Reference: D. J. Wales, J. P. K. Doye, J. Phys. Chem. A 101 (1997), 5111-5116, basin hopping
+    without temperature.
+    """
+    structure = fit.structure
+    spans = [structure.span(i) for i, c in enumerate(structure.effects) if c.effect.contact]
+    places = np.concatenate([np.arange(span.start, span.stop) for span in spans])
+    rng, vain = np.random.default_rng(0), 0
+    for hop in range(_HOPS):
+        if fit.chi < AT_FLOOR or vain == _VAIN:
+            break
+        theta: Array = fit.theta.copy()
+        theta[places] += _WIDTHS[hop % 2] * rng.standard_normal(places.size)
+        trial = study.fit(replace(fit, theta=theta), iterations=6, scatter_free=False)
+        vain = 0 if trial.cost < fit.cost else vain + 1
+        fit = min(fit, trial, key=lambda one: one.cost)
+    return fit
 
 
 # ---------------------------------- laws of the prediction-error fit as effects of the catalogue
