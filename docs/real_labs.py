@@ -178,8 +178,8 @@ def rows(analysis: Analysis, gap: Gap) -> Iterator[str]:
     if analysis.fit is None and driven:
         # The report needs a run in open loop; the search for effects does not.
         chain, units = gap.chain, gap.chain.units
-        yield f"- mass: {with_unit(chain.m[0], gap.chain_std['m_1'], units.m)}"
-        yield f"- damping: {with_unit(chain.c[0], gap.chain_std['c_1'], units.c)}"
+        yield f"- mass: {with_unit(chain.m[0], gap.chain_std.get('m_1'), units.m)}"
+        yield f"- damping: {with_unit(chain.c[0], gap.chain_std.get('c_1'), units.c)}"
     rubbed = [d for d in analysis.log_decrements if d.law.is_friction]
     for cart in sorted({d.cart for d in rubbed}):
         own = [d for d in rubbed if d.cart == cart]

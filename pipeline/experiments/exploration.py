@@ -519,13 +519,17 @@ def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
     if gap is None or not acting:
         return analysis
     model, covariance = gap.model, gap.chain_covariance
+    if covariance is None:  # the errors of a chain without the effects would be wrong
+        unknown = {name: replace(one, std=None) for name, one in fit.parameters.items()}
+        if model.chain.is_tied:
+            values = model.chain.parameters().items()
+            unknown = {
+                name: Estimate(value=value, std=None, source="gap") for name, value in values
+            }
+            fit = replace(fit, chain=model.chain, converged=True)
+        return replace(analysis, fit=replace(fit, parameters=unknown))
     if not model.chain.is_tied:
         return analysis
-    if covariance is None:  # the errors of a chain without the effects would be wrong
-        values = model.chain.parameters().items()
-        unknown = {name: Estimate(value=value, std=None, source="gap") for name, value in values}
-        fit = replace(fit, chain=model.chain, parameters=unknown, converged=True)
-        return replace(analysis, fit=fit)
     names = tuple(gap.chain_std)
     # With effects, the residual of the linear chain is not noise, so only the encoders' noise is
     # used.

@@ -225,6 +225,7 @@ _LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s; with a contact, pieces grow to whole runs
 # rigid, but the simulator's contact is slightly soft.
 _VARIED = ((1.0, 1.0), (1.2, 1.0), (1.0, 0.65), (1.2, 0.65))
 _HOPS, _VAIN = 40, 15  # most jumps, and most in a row that lead nowhere
+_LEAN = 2  # most effects of a model that jumps
 _WIDTHS = (0.15, 0.075)  # relative sizes of the jumps of a contact's parameters, in turn
 _NEAR = 8  # iterations of a fit that starts near its end
 # Options without springs: the cost of a whole run has many minima, and small gains add up.
@@ -246,7 +247,6 @@ def fit_free_run(start: GapModel, study: Study) -> GapFit:
     fit = study.fit(start, scatter_free=False, **steps)
     if fit.chi > AT_FLOOR and structure.has_play:
         fit = min(fit, _fit_contact_on_pieces(start, study), key=lambda one: one.cost)
-        fit = _hop(fit, study)
     # Two rounds in which friction differs between runs. Before each, the worst runs are restarted.
     for attempt in range(2):
         if not structure.many_rests or fit.chi < AT_FLOOR:
@@ -294,21 +294,25 @@ def _fit_contact_on_pieces(start: GapModel, study: Study) -> GapFit:
     return min(grown, key=lambda one: one.cost)
 
 
-def _hop(fit: GapFit, study: Study) -> GapFit:
+def hop(fit: GapFit, study: Study) -> GapFit:
     """Leave the narrow minimum of a fit with backlash for lower ones, by random jumps.
+
+    Other fits are returned as they are, and those of many effects too: each jump costs a fit.
 
     Reference: D. J. Wales, J. P. K. Doye, J. Phys. Chem. A 101 (1997), 5111-5116, basin hopping
     without temperature.
     """
     structure = fit.structure
+    if not structure.has_play or len(structure.effects) > _LEAN:
+        return fit
     spans = [structure.span(i) for i, c in enumerate(structure.effects) if c.effect.contact]
     places = np.concatenate([np.arange(span.start, span.stop) for span in spans])
     rng, vain = np.random.default_rng(0), 0
-    for hop in range(_HOPS):
+    for jump in range(_HOPS):
         if fit.chi < AT_FLOOR or vain == _VAIN:
             break
         theta: Array = fit.theta.copy()
-        theta[places] += _WIDTHS[hop % 2] * rng.standard_normal(places.size)
+        theta[places] += _WIDTHS[jump % 2] * rng.standard_normal(places.size)
         trial = study.fit(replace(fit, theta=theta), iterations=6, scatter_free=False)
         vain = 0 if trial.cost < fit.cost else vain + 1
         fit = min(fit, trial, key=lambda one: one.cost)
@@ -466,8 +470,9 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
     """Drop effects that the others make needless; append every hypothesis tried to `found`.
 
     An effect may also be replaced by a simpler law. An effect within three standard errors of zero
-    is dropped too. Of the few least certain effects, the least needed goes first. Losses add up, so
-    each hypothesis is compared with the best so far, and with the one that it is made from.
+    is dropped too, unless it halves the error. Of the few least certain effects, the least needed
+    goes first. Losses add up, so each hypothesis is compared with the best so far, and with the one
+    that it is made from.
     """
     best = chosen
     while chosen.key:
@@ -522,20 +527,25 @@ def without_zero_effect(chosen: Hypothesis, final: GapFit, study: Study) -> Hypo
 
     `final` is the fit of `chosen` with its covariance.
     """
-    sure = significance(final)
-    if not sure or min(sure) >= SURE:
-        return None
-    without = _without(chosen, chosen.fit.structure.effects[int(np.argmin(sure))], study)
-    return without if _may_be_zero(min(sure), without, chosen) else None
+    sure, effects = significance(final), chosen.fit.structure.effects
+    for index in np.argsort(sure, kind="stable").tolist():
+        if sure[index] >= SURE:
+            break
+        without = _without(chosen, effects[index], study)
+        if _may_be_zero(sure[index], without, chosen):
+            return without
+    return None
 
 
 def _may_be_zero(sure: float, without: Hypothesis, chosen: Hypothesis) -> bool:
     """Return whether an effect may be zero, given its distance from zero in standard errors.
 
     The standard error is also large if the recordings show an effect but hardly tell its force in
-    the unit of the others. An effect that halves the error is not zero.
+    the unit of the others. An effect that halves the error is not zero. With backlash, a refit
+    without the effect may only be stuck in a narrow minimum, so its error proves nothing.
     """
-    return sure < SURE and limits.MOSTLY * without.error < chosen.error
+    halves = bool(np.isfinite(without.error)) and limits.MOSTLY * without.error >= chosen.error
+    return sure < SURE and (chosen.fit.structure.has_play or not halves)
 
 
 def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:

@@ -28,7 +28,7 @@ BIC_DROP, SAME_LAW = 20.0, 6.0
 # 1.02 times the noise. If a named model without a contact has an error above FURTHER, half of the
 # true effects are often missing, and a note says so.
 ENOUGH_NOISE, ENOUGH_REPEATS, FURTHER = 2.0, 1.5, 1.3
-SURE = 3.0  # standard errors; an effect closer to zero is not named
+SURE = 3.0  # standard errors; an effect closer to zero is not named unless it halves the error
 # Share of the error that may remain after a new effect, if the gap cannot be named.
 PARTIAL_GAIN = 0.9
 # Share of the excess that a law must remove if there is backlash. The contact of a model that

@@ -26,6 +26,7 @@ from pipeline.gap.judge import (
     filled,
     finish,
     fit_free_run,
+    hop,
     judge,
     prune,
     reach_verdict,
@@ -196,6 +197,7 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
             return baseline, found
         full = judge(fit_free_run(_as_model(lean, study, records), study), study)
         found.append(full)
+        found[-1] = full = _lower(full, study)
         study.progress(f"{full.size} laws remain: error {full.error:.1%}")
         made = build_up(full, baseline, study) if study.explains(full) else [full]
         found += [h for h in made if h is not full]
@@ -212,11 +214,23 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
             chosen = prune(min(sound, key=lambda h: h.bic_of_all), study, found)
         if not study.is_noise(chosen):
             chosen = enrich(chosen, study, found)
+            # Its rivals of the same size jump too, so that all are compared at the same stage.
+            size, lower = len(chosen.key), dict[int, Hypothesis]()
+            with suppress(OutOfTime):
+                lower |= {id(h): _lower(h, study) for h in found if len(h.key) == size}
+            chosen = lower.get(id(chosen), chosen)
+            found[:] = [lower.get(id(h), h) for h in found]
         usable = chosen.is_credible and np.isfinite(chosen.error)
         return chosen if usable else baseline, [h for h in found if h.is_credible]
     found = [h for h in found if np.isfinite(h.error) and h.is_credible]
     worth = [h for h in found if worth_it(h, baseline, study)]
     return min(worth, key=lambda h: h.bic, default=baseline), found
+
+
+def _lower(hypothesis: Hypothesis, study: Study) -> Hypothesis:
+    """Return a hypothesis with backlash in a lower minimum, if jumps lead to one."""
+    fit = hop(hypothesis.fit, study)
+    return hypothesis if fit is hypothesis.fit else judge(fit, study)
 
 
 def _restricted(lean: PemFit, model: Hypothesis, records: Records) -> PemFit:

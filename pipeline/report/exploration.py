@@ -109,7 +109,8 @@ def _story(page: Page, turns: Sequence[Turn]) -> list[Block]:
 
 
 def _errors(page: Page, turns: Sequence[Turn], wanted: float) -> list[Block]:
-    names = [name for name in turns[-1].errors if turns[-1].errors[name] is not None]
+    last = turns[-1].errors
+    names = [one for one in last if any(turn.errors.get(one) is not None for turn in turns)]
     if not names:
         return []
     rows = [[name_span(name), *(_known(turn.errors.get(name)) for turn in turns)] for name in names]

@@ -42,7 +42,9 @@ def _of_unexplained(gap: Gap) -> str:
     """Return which phrase tells why a gap is unexplained."""
     if not gap.complete:
         return "undecided"
-    return "no_model" if min(gap.baseline, gap.final) > NO_MODEL else "unexplained"
+    taught = [row.baseline for row in gap.by_record if not row.held_out]
+    fails = gap.baseline > NO_MODEL and max(taught, default=0.0) > NO_MODEL
+    return "no_model" if fails else "unexplained"
 
 
 def is_set_up_alone(gap: Gap) -> bool:
