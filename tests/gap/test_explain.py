@@ -311,3 +311,15 @@ def test_an_effect_only_in_the_held_out_data_is_found():
     assert gap.verdict == "named"
     assert gap.final < 1.05 * gap.noise_floor
     assert any("were exchanged" in note for note in gap.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_fit_with_backlash_leaves_narrow_minima():
+    """Without jumps it ends at twice the noise, which is only part of the gap."""
+    case = make_case(seed=900_093, n=1, effects=["backlash"])
+    gap = explain_gap(case.records, Setup(springs=case.springs))
+    assert gap.verdict == "named"
+    assert [found.effect.key for found in gap.effects] == ["backlash"]
+    gaps = gap.effects[0].parameters["gap"].value, float(case.hidden[0].parameters["gap"])
+    assert gaps[0] == pytest.approx(gaps[1], rel=0.2)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.gap.judge import Hypothesis, Study, reach_verdict, worth_it
+from pipeline.gap.judge import Hypothesis, Study, _may_be_zero, reach_verdict, worth_it
 from pipeline.gap.summary import list_effects
 from pipeline.plant.catalogue import find_effect
 from pipeline.setup import Units
@@ -178,3 +178,21 @@ def test_an_effect_that_all_explanations_share_is_certain():
     )
     assert (friction.confidence, second.confidence) == (1.0, 0.5)
     assert [rival.confidence for rival in second.rivals] == [0.5]
+
+
+@pytest.mark.parametrize(
+    ("key", "sure", "without", "zero"),
+    [
+        (COULOMB, 2.9, 0.039, True),
+        (COULOMB, 3.1, 0.039, False),  # far enough from zero
+        (COULOMB, 0.5, 0.041, False),  # it halves the error
+        (COULOMB, 0.5, np.inf, True),  # a refit that diverges proves nothing
+        (("backlash", 0), 0.5, 0.041, True),  # nor does one in a narrow minimum
+    ],
+)
+def test_an_effect_that_halves_the_error_is_not_zero(key, sure, without, zero):
+    """An effect within three standard errors of zero goes, unless it halves the error of 2 %."""
+    chosen = hypothesis(key, error=0.02, bic=0.0)
+    structure: Any = chosen.fit.structure
+    structure.has_play = key[0] == "backlash"
+    assert _may_be_zero(sure, hypothesis(error=without, bic=0.0), chosen) == zero

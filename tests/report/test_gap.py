@@ -468,6 +468,21 @@ def test_a_cart_beside_one_that_was_not_measured_has_no_residual_force():
 # --------------------------------------------------------------------- the file
 
 
+@pytest.mark.parametrize(
+    ("training", "held_out", "fails"), [(0.5, 0.5, True), (0.3, 0.5, False), (0.5, 0.3, False)]
+)
+def test_a_linear_model_that_fails_everywhere_is_called_so(training, held_out, fails):
+    """It must fail where it was fitted as well: there, nothing beyond the recordings is asked."""
+    gap = make_gap("unexplained", ())
+    rows = tuple(
+        replace(row, baseline=held_out if row.held_out else training) for row in gap.by_record
+    )
+    gap = replace(gap, baseline=held_out, final=held_out, by_record=rows)
+    assert any(row.held_out for row in rows)
+    assert not all(row.held_out for row in rows)
+    assert (WORDS.text("title_no_model") in terminal_verdict(gap)) == fails
+
+
 @pytest.mark.parametrize("verdict", ["named", "partial", "none", "ambiguous", "unexplained"])
 def test_the_file_is_read_back_as_it_was(verdict):
     """A `gap.json` that is read and written again is the same, with the same verdict."""
