@@ -183,7 +183,7 @@ class Recorded:
     ids : ids of the recordings that were made.
     seconds : total time of all attempts, in s.
     vetoed : whether recordings are missing because a person at the bench refused them.
-    why : why requested recordings are missing; empty if none are, or if the reason is unknown.
+    why : why requested recordings are missing; empty if all came or the reason is unknown.
     """
 
     ids: tuple[str, ...] = ()

@@ -224,9 +224,9 @@ _LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s; with a contact, pieces grow to whole runs
 # Factors on the size and damping of a contact at the start of a fit. The contact in `gap.pem` is
 # rigid, but the simulator's contact is slightly soft.
 _VARIED = ((1.0, 1.0), (1.2, 1.0), (1.0, 0.65), (1.2, 0.65))
-_HOPS, _VAIN = 40, 15  # most jumps, and most in a row that lead nowhere
-_LEAN = 2  # most effects of a model that jumps
-_WIDTHS = (0.15, 0.075)  # relative sizes of the jumps of a contact's parameters, in turn
+_JUMPS, _IN_VAIN = 40, 15  # most jumps, and most in a row that find no lower cost
+_WIDTHS = (0.15, 0.075)  # relative sizes of the jumps, in turn
+_FEW_TO_HOP = 2  # most effects of a model that jumps, because each jump costs a fit
 _NEAR = 8  # iterations of a fit that starts near its end
 # Options without springs: the cost of a whole run has many minima, and small gains add up.
 _FINISHED: dict[str, Any] = {"iterations": 60, "tolerance": 1e-6}
@@ -294,27 +294,28 @@ def _fit_contact_on_pieces(start: GapModel, study: Study) -> GapFit:
     return min(grown, key=lambda one: one.cost)
 
 
-def hop(fit: GapFit, study: Study) -> GapFit:
-    """Leave the narrow minimum of a fit with backlash for lower ones, by random jumps.
+def basin_hopping(fit: GapFit, study: Study) -> GapFit:
+    """Leave a narrow minimum of the cost with backlash for lower ones, by random jumps.
 
-    Other fits are returned as they are, and those of many effects too: each jump costs a fit.
+    The parameters of the contact jump; then all are fitted. A fit without backlash, or with more
+    than two effects, is returned as it is.
 
-    Reference: D. J. Wales, J. P. K. Doye, J. Phys. Chem. A 101 (1997), 5111-5116, basin hopping
-    without temperature.
+    Reference: D. J. Wales, J. P. K. Doye, J. Phys. Chem. A 101 (1997), 5111-5116; here without
+    temperature.
     """
     structure = fit.structure
-    if not structure.has_play or len(structure.effects) > _LEAN:
+    if not structure.has_play or len(structure.effects) > _FEW_TO_HOP:
         return fit
     spans = [structure.span(i) for i, c in enumerate(structure.effects) if c.effect.contact]
     places = np.concatenate([np.arange(span.start, span.stop) for span in spans])
-    rng, vain = np.random.default_rng(0), 0
-    for jump in range(_HOPS):
-        if fit.chi < AT_FLOOR or vain == _VAIN:
+    rng, in_vain = np.random.default_rng(0), 0
+    for jump in range(_JUMPS):
+        if fit.chi < AT_FLOOR or in_vain == _IN_VAIN:
             break
         theta: Array = fit.theta.copy()
         theta[places] += _WIDTHS[jump % 2] * rng.standard_normal(places.size)
         trial = study.fit(replace(fit, theta=theta), iterations=6, scatter_free=False)
-        vain = 0 if trial.cost < fit.cost else vain + 1
+        in_vain = 0 if trial.cost < fit.cost else in_vain + 1
         fit = min(fit, trial, key=lambda one: one.cost)
     return fit
 
@@ -523,7 +524,7 @@ def enrich(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothe
 
 
 def without_zero_effect(chosen: Hypothesis, final: GapFit, study: Study) -> Hypothesis | None:
-    """Return a hypothesis without the least certain effect, if it may be zero; otherwise None.
+    """Return a hypothesis without the least certain effect that may be zero, or else None.
 
     `final` is the fit of `chosen` with its covariance.
     """

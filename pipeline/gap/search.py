@@ -21,12 +21,12 @@ from pipeline.gap.judge import (
     Hypothesis,
     Study,
     as_model,
+    basin_hopping,
     build_up,
     enrich,
     filled,
     finish,
     fit_free_run,
-    hop,
     judge,
     prune,
     reach_verdict,
@@ -197,7 +197,7 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
             return baseline, found
         full = judge(fit_free_run(_as_model(lean, study, records), study), study)
         found.append(full)
-        found[-1] = full = _lower(full, study)
+        found[-1] = full = _in_lower_minimum(full, study)
         study.progress(f"{full.size} laws remain: error {full.error:.1%}")
         made = build_up(full, baseline, study) if study.explains(full) else [full]
         found += [h for h in made if h is not full]
@@ -214,12 +214,13 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
             chosen = prune(min(sound, key=lambda h: h.bic_of_all), study, found)
         if not study.is_noise(chosen):
             chosen = enrich(chosen, study, found)
-            # Its rivals of the same size jump too, so that all are compared at the same stage.
-            size, lower = len(chosen.key), dict[int, Hypothesis]()
+            # Rivals of the same size are improved too, so all are compared at the same stage.
+            at = found.index(chosen)
             with suppress(OutOfTime):
-                lower |= {id(h): _lower(h, study) for h in found if len(h.key) == size}
-            chosen = lower.get(id(chosen), chosen)
-            found[:] = [lower.get(id(h), h) for h in found]
+                for i, h in enumerate(found):
+                    if len(h.key) == len(chosen.key):
+                        found[i] = _in_lower_minimum(h, study)
+            chosen = found[at]
         usable = chosen.is_credible and np.isfinite(chosen.error)
         return chosen if usable else baseline, [h for h in found if h.is_credible]
     found = [h for h in found if np.isfinite(h.error) and h.is_credible]
@@ -227,9 +228,9 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
     return min(worth, key=lambda h: h.bic, default=baseline), found
 
 
-def _lower(hypothesis: Hypothesis, study: Study) -> Hypothesis:
+def _in_lower_minimum(hypothesis: Hypothesis, study: Study) -> Hypothesis:
     """Return a hypothesis with backlash in a lower minimum, if jumps lead to one."""
-    fit = hop(hypothesis.fit, study)
+    fit = basin_hopping(hypothesis.fit, study)
     return hypothesis if fit is hypothesis.fit else judge(fit, study)
 
 

@@ -187,10 +187,11 @@ def list_suspects(
     """Return the effects that help most when used alone, the best first, except for `effects`."""
     baseline = next(h for h in found if not h.key)
     listed = {(f.effect.key, next(iter(f.where.values()), 0)) for f in effects}
-    better = (h for h in found if len(h.key) == 1 and h.bic < baseline.bic)
-    # Of several fits of one effect, the best one counts.
-    best = {h.key: h for h in sorted(better, key=lambda h: -h.bic) if not h.key <= listed}
-    singles = sorted(best.values(), key=lambda h: h.bic)
+    best: dict[frozenset[tuple[str, int]], Hypothesis] = {}  # of several fits of one effect
+    for h in sorted(found, key=lambda h: h.bic):
+        if len(h.key) == 1 and h.bic < baseline.bic and not h.key <= listed:
+            best.setdefault(h.key, h)
+    singles = [*best.values()]
     weights = [float(np.exp(-0.5 * (h.bic - singles[0].bic))) for h in singles]
     return tuple(
         _rival(next(iter(h.key)), h, weight / sum(weights))

@@ -8,13 +8,7 @@ from matplotlib.figure import Figure
 from pipeline import __version__
 from pipeline.arrays import Array
 from pipeline.estimation.force_balance import without_releases
-from pipeline.gap.advice import (
-    MOST_NAMES,
-    differences,
-    disputed,
-    proposed_recording,
-    side_names,
-)
+from pipeline.gap.advice import MOST_NAMES, differences, disputed, proposed_recording, side_names
 from pipeline.gap.replay import Replay, replay_driven
 from pipeline.gap.residual import ResidualForce, residual_forces
 from pipeline.gap.types import FoundEffect, Gap, GapWindow, RecordGap, Trace

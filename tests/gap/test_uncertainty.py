@@ -83,4 +83,5 @@ def test_standard_errors_with_a_contact(effect, stated):
     for name, true in hidden.parameters.items() if stated else ():
         value = found.parameters[name]
         assert value.std is not None
+        assert value.std < 0.3 * abs(value.value)  # that of the stiffness is 13 %
         assert abs(value.value - float(true)) < 4.0 * value.std

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.gap.explain import _is_rugged
 from pipeline.gap.judge import Hypothesis, Study, _may_be_zero, reach_verdict, worth_it
 from pipeline.gap.summary import list_effects
 from pipeline.plant.catalogue import find_effect
@@ -196,3 +197,19 @@ def test_an_effect_that_halves_the_error_is_not_zero(key, sure, without, zero):
     structure: Any = chosen.fit.structure
     structure.has_play = key[0] == "backlash"
     assert _may_be_zero(sure, hypothesis(error=without, bic=0.0), chosen) == zero
+
+
+@pytest.mark.parametrize(
+    ("play", "contact", "chi", "rugged"),
+    [
+        (True, True, 1.0, True),
+        (False, True, 1.14, False),
+        (False, True, 1.16, True),
+        (False, False, 9.0, False),
+    ],
+)
+def test_only_a_contact_makes_the_cost_rugged(play, contact, chi, rugged):
+    """Backlash always does, an end stop while the error exceeds the noise."""
+    structure = SimpleNamespace(has_play=play, has_contact=contact)
+    fit: Any = SimpleNamespace(structure=structure, chi=chi)
+    assert _is_rugged(fit) == rugged
